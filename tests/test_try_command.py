@@ -3,10 +3,13 @@
 import re
 from functools import wraps
 
+import cv2
+import numpy as np
 import pytest
 import rerun as rr
 
 import stages
+from recordings.comparison.sweep import chart
 from recordings.comparison.text import moment
 from tests.conftest import FRAMES, SMALL, rewrite, roverflow
 
@@ -54,11 +57,11 @@ def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path
     assert errors.keys() == {"A", "B", "C"}
     assert errors["B"] > 1.5 * errors["C"]
     charts = {chunk.entity_path: chunk for chunk in rr.chunk.RrdReader(str(tmp_path / "try.rrd")).stream()}
-    heights, places = (
-        charts["/sweep/2/variants"].to_record_batch().column(f"BarChart:{part}").to_pylist()[0][0]["buffer"]
-        for part in ("values", "abscissa")
+    (blob,) = charts["/sweep/2"].to_record_batch().column("EncodedImage:blob").to_pylist()[0]
+    picture = cv2.imdecode(np.array(blob, np.uint8), cv2.IMREAD_COLOR)
+    np.testing.assert_array_equal(
+        picture[..., ::-1], chart("disparities", ["16", "64"], [errors[label] for label in "ABC"])
     )
-    assert (places, heights) == ([16, 64], [errors["B"], errors["C"]])
 
 
 def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, capsys):

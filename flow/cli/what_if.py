@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -44,21 +43,16 @@ def changes_of(given: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return {"A": (), **{chr(ord("B") + number): changes for number, changes in enumerate(variants)}}
 
 
-def swept_setting(changes: Mapping[str, Sequence[str]]) -> tuple[str, list[float]] | None:
-    """The name, with its unit, and the numbers of the setting that variants differ in; None for other values.
+def swept_setting(changes: Mapping[str, Sequence[str]]) -> tuple[str, list[str]] | None:
+    """The name and the values of the setting that variants differ in; None for a single variant.
 
     Examples
     --------
     >>> swept_setting(changes_of(["points.camera_height=1 m", "points.camera_height=1.2 m"]))
-    ('points.camera_height (m)', [1.0, 1.2])
+    ('points.camera_height', ['1 m', '1.2 m'])
     """
     last = [own[-1].partition("=") for label, own in changes.items() if label != "A"]
-    found = [re.fullmatch(r"\s*([-+.\deE]+?)\s*([a-zA-Z%].*)?", value) for _, _, value in last]
-    units = {match[2] or "" for match in found if match}
-    if len(last) < 2 or None in found or len(units) > 1:
-        return None
-    unit, name = units.pop(), last[0][0].strip()
-    return f"{name} ({unit})" if unit else name, [float(match[1]) for match in found if match]
+    return (last[0][0].strip(), [value.strip() for _, _, value in last]) if len(last) > 1 else None
 
 
 def run_variants(

@@ -45,7 +45,7 @@ def write_marked(path: Path, image: Array, pixels: Array, title: str) -> None:
         zoomed = cv2.resize(part, (height, height), interpolation=cv2.INTER_NEAREST)
         rgb = np.hstack([rgb, np.full((height, 8, 3), 255, np.uint8), zoomed])
     with written(path) as temporary:
-        _, blob = cv2.imencode(".png", cv2.cvtColor(page_of(rgb, title), cv2.COLOR_RGB2BGR))
+        _, blob = cv2.imencode(".png", cv2.cvtColor(page_of(rgb, title, beside=1), cv2.COLOR_RGB2BGR))
         temporary.write_bytes(_named(blob.tobytes()))
 
 

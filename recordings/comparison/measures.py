@@ -9,7 +9,7 @@ import numpy as np
 
 from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy_grid
 from recordings.scoring.metrics import angle_between
-from stages.data import Array, Cell, ElevationMap, NavigationMap
+from stages.data import Array, Cell, NavigationMap
 
 Measures = dict[str, float]
 Layers = Mapping[str, Array]
@@ -60,11 +60,6 @@ def side_by_side(one: Layers, other: Layers, grids: Sequence[Any]) -> dict[str, 
 
     names = [name for name in one if name in other]
     return {name: (placed(one[name], first[0]), placed(other[name], first[1])) for name in names}
-
-
-def elevations(one: ElevationMap, other: ElevationMap) -> tuple[Array, Array]:
-    """The elevations of two maps on one grid, m."""
-    return side_by_side(one.layers, other.layers, (one, other))["elevation"]
 
 
 def cells(one: NavigationMap, other: NavigationMap) -> tuple[Array, Array]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from recordings.comparison.measures import cells, elevations
 from recordings.export.page_layout import add_bar, add_legend, map_page, page_of, with_rover
-from recordings.export.png_pages import disparity_page, elevation_page, navigation_page
+from recordings.export.png_pages import disparity_page, relief_page, verdict_page
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_layers, read_occupancy_grid
 from recordings.sinks import colormaps
 from stages.data import Array, Cell, ElevationMap, NavigationMap
@@ -18,7 +18,7 @@ DISPARITY_LIMIT = 1.0  # px at the ends of the scale
 HEIGHT_LIMIT = 0.05  # m
 _GRID_MAP = "grid_map_msgs/msg/GridMap"
 _LESS, _NONE, _MORE = np.array([[33, 102, 172], [247, 247, 247], [178, 24, 43]], np.float32)
-ONLY_ONE = {1: ("only in A", (120, 90, 160)), 2: ("only in B", (70, 150, 110))}
+ONLY_ONE = {1: ("only in A", (120, 90, 160)), 2: ("not in A", (70, 150, 110))}
 FLIPS = {
     0: ("same", (225, 225, 222)),
     1: ("now free", (60, 170, 90)),
@@ -28,7 +28,7 @@ FLIPS = {
 
 
 def pages(schema: str, one: Any, other: Any) -> tuple[Array, Array, Array] | None:
-    """A, B, and B less A as RGB pages; None for a type without pages.
+    """A, B, and B less A as RGB pages with one extent and one scale; None for a type without pages.
 
     Parameters
     ----------
@@ -50,27 +50,34 @@ def signed_colors(change: Array, limit: float) -> Array:
     return np.asarray(rgb + 0.5, np.uint8)
 
 
-def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array]:
+def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array] | None:
     first, second = read_disparity(one), read_disparity(other)
-    page = page_of(_change_colors(first, second, DISPARITY_LIMIT), "B less A, px")
+    if first.shape != second.shape:
+        return None
+    limit = max(map(colormaps.disparity_limit, (first, second)))
+    page = page_of(_change_colors(first, second, DISPARITY_LIMIT), "change from A, px")
     add_bar(page, -DISPARITY_LIMIT, DISPARITY_LIMIT, lambda values: signed_colors(values, DISPARITY_LIMIT), ONLY_ONE)
-    return disparity_page(first), disparity_page(second), page
+    return disparity_page(first, limit), disparity_page(second, limit), page
 
 
 def _elevations(one: Any, other: Any) -> tuple[Array, Array, Array]:
-    first, second = read_grid_map(one), read_grid_map(other)
-    page = _map(_change_colors(*elevations(first, second), HEIGHT_LIMIT), first, second, "B less A, m")
+    first, second = _on_one_grid(*(colormaps.terrain_ahead(read_grid_map(message)) for message in (one, other)))
+    heights = [grid.layers["elevation"] for grid in (first, second)]
+    limits = colormaps.elevation_limits(np.concatenate([layer.ravel() for layer in heights]))
+    page = _map(_change_colors(heights[0], heights[1], HEIGHT_LIMIT), first, "change from A, m")
     add_bar(page, -HEIGHT_LIMIT, HEIGHT_LIMIT, lambda values: signed_colors(values, HEIGHT_LIMIT), ONLY_ONE)
-    return elevation_page(first), elevation_page(second), page
+    return relief_page(first, limits), relief_page(second, limits), page
 
 
 def _verdicts(one: Any, other: Any) -> tuple[Array, Array, Array]:
-    first, second = read_occupancy_grid(one), read_occupancy_grid(other)
-    before, after = cells(first, second)
+    first, second = _on_one_grid(
+        *(colormaps.navigation_ahead(read_occupancy_grid(message)) for message in (one, other))
+    )
+    before, after = first.cells, second.cells
     codes = np.select([before == after, after == Cell.FREE, after == Cell.HAZARD], [0, 1, 2], 3)
-    page = _map(colormaps.legend_colors(codes, FLIPS), first, second, "verdicts, B against A")
+    page = _map(colormaps.legend_colors(codes, FLIPS), first, "change from A")
     add_legend(page, FLIPS)
-    return navigation_page(first), navigation_page(second), page
+    return verdict_page(first), verdict_page(second), page
 
 
 def _change_colors(one: Array, other: Array, limit: float) -> Array:
@@ -81,16 +88,44 @@ def _change_colors(one: Array, other: Array, limit: float) -> Array:
     return rgb
 
 
-def _map(rgb: Array, one: ElevationMap | NavigationMap, other: ElevationMap | NavigationMap, title: str) -> Array:
-    """A page of the grid that contains both."""
-    origin = (min(one.origin[0], other.origin[0]), min(one.origin[1], other.origin[1]))
-    nothing = np.zeros(rgb.shape[:2], np.uint8)
-    whole = NavigationMap(one.stamp, nothing.view(np.int8), nothing, one.resolution, origin, one.frame_id)
-    extended, corner = with_rover(rgb, whole, colormaps.UNKNOWN_RGB)
-    return map_page(extended, one.resolution, corner, f"{title} ({one.frame_id})")
+def _on_one_grid(one: Any, other: Any) -> tuple[Any, Any]:
+    """Two elevation maps, or two navigation maps, on the smallest grid that contains both, with the smaller cells."""
+    step = min(one.resolution, other.resolution)
+    low = np.minimum(one.origin, other.origin)
+    high = np.maximum(*(np.add(grid.origin, np.array(_shape(grid)[::-1]) * grid.resolution) for grid in (one, other)))
+    columns, rows = (np.arange(round(length)) for length in (high - low) / step)
+
+    def placed(grid: Any, layer: Array, unknown: float) -> Array:
+        places = [
+            np.floor((start + (cells + 0.5) * step - origin) / grid.resolution).astype(int)
+            for start, cells, origin in zip(low[::-1], (rows, columns), grid.origin[::-1], strict=True)
+        ]
+        inside = [(place >= 0) & (place < size) for place, size in zip(places, layer.shape, strict=True)]
+        whole = np.full((rows.size, columns.size), unknown, layer.dtype)
+        whole[np.ix_(*inside)] = layer[np.ix_(*(place[known] for place, known in zip(places, inside, strict=True)))]
+        return whole
+
+    def extended(grid: Any) -> Any:
+        place: dict[str, Any] = {"resolution": step, "origin": (float(low[0]), float(low[1]))}
+        if isinstance(grid, ElevationMap):
+            return replace(grid, layers={"elevation": placed(grid, grid.layers["elevation"], np.nan)}, **place)
+        cells = placed(grid, grid.cells, Cell.UNKNOWN)
+        return replace(grid, cells=cells, reason=np.zeros(cells.shape, np.uint8), **place)
+
+    return extended(one), extended(other)
 
 
-_PAGES: Mapping[str, Callable[[Any, Any], tuple[Array, Array, Array]]] = {
+def _shape(grid: ElevationMap | NavigationMap) -> tuple[int, ...]:
+    return grid.shape if isinstance(grid, ElevationMap) else grid.cells.shape
+
+
+def _map(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Array:
+    """A page of a map's cells."""
+    extended, corner = with_rover(rgb, grid, colormaps.UNKNOWN_RGB)
+    return map_page(extended, grid.resolution, corner, f"{title} ({grid.frame_id})")
+
+
+_PAGES: Mapping[str, Callable[[Any, Any], tuple[Array, Array, Array] | None]] = {
     "stereo_msgs/msg/DisparityImage": _disparities,
     _GRID_MAP: _elevations,
     "nav_msgs/msg/OccupancyGrid": _verdicts,

@@ -21,7 +21,7 @@ from recordings.sinks.png import png
 
 MAX_FRAMES = 50  # stamps that are drawn
 MAX_WAITING = 4  # messages that wait for a thread that draws them
-_SIDES = {"a": "A", "b": "B", "difference": "B less A"}  # entity -> name of its view
+_SIDES = {"a": "A", "b": "{}", "difference": "{} less A"}  # entity -> name of its view, of a variant
 
 
 class DiffRecording:
@@ -37,6 +37,7 @@ class DiffRecording:
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.left_out = 0
+        self._names = dict[str, str]()
         self._drawing: list[tuple[str, int, Future[tuple[bytes, ...]]]] = []
         self._threads = ThreadPoolExecutor(2, thread_name_prefix="pages")
 
@@ -46,9 +47,11 @@ class DiffRecording:
         drawn = ((topic, stamp, pages.result()) for topic, stamp, pages in self._drawing)
         return [each for each in drawn if each[2]]
 
-    def of(self, variant: str = "") -> Callable[[MessageDifference], None]:
-        """A function that draws differences, unless enough stamps are drawn; variant: the name of B."""
-        return partial(self._add, f"/{variant}" if variant else "")
+    def of(self, variant: str = "", name: str = "B") -> Callable[[MessageDifference], None]:
+        """A function that draws differences, unless enough stamps are drawn. variant: letter of B; name: its tab."""
+        prefix = f"/{variant}" if variant else ""
+        self._names[prefix] = name
+        return partial(self._add, prefix)
 
     def _add(self, prefix: str, change: MessageDifference) -> None:
         if change.one is None or change.other is None:
@@ -83,23 +86,28 @@ class DiffRecording:
             stream.disconnect()
 
     def _blueprint(self, plots: list[rrb.Container]) -> rrb.Blueprint:
-        topics = dict.fromkeys(topic for topic, _, _ in self.pictures)
+        paths = dict[str, dict[str, None]]()
+        for path, _, _ in self.pictures:
+            paths.setdefault(path[: path.index("/nav/")], {})[path] = None
         tabs: list[rrb.Container] = [
             *plots,
             *(
-                rrb.Horizontal(
-                    *(rrb.Spatial2DView(origin=f"{topic}/{side}", name=title) for side, title in _SIDES.items()),
-                    name=topic,
-                )
-                for topic in topics
+                rrb.Tabs(*(_beside(path, variant[1:] or "B") for path in own), name=self._names[variant])
+                for variant, own in paths.items()
             ),
         ]
         table = rrb.TextDocumentView(origin="tables", name="what differs")
         return rrb.Blueprint(
-            rrb.Vertical(rrb.Tabs(*tabs), table, row_shares=[3, 1]) if tabs else table,
+            rrb.Vertical(rrb.Tabs(*tabs) if tabs[1:] else tabs[0], table, row_shares=[3, 1]) if tabs else table,
             rrb.TimePanel(state="collapsed", timeline=CLOCK),
             collapse_panels=True,
         )
+
+
+def _beside(path: str, variant: str) -> rrb.Container:
+    """The pages of a topic beside each other."""
+    views = (rrb.Spatial2DView(origin=f"{path}/{side}", name=name.format(variant)) for side, name in _SIDES.items())
+    return rrb.Horizontal(*views, name=path[path.index("/nav") :])
 
 
 def _drawn(change: MessageDifference) -> tuple[bytes, ...]:

@@ -1,49 +1,91 @@
-"""Figures over the values of a swept setting, as bar charts of a recording."""
+"""Figures over the values of a swept setting, as charts of a recording."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from recordings.comparison.diff import Diff
+from recordings.export.page_layout import INK, PAPER
+from recordings.sinks.png import png
+from stages.data import Array
 
-A_RGB, VARIANT_RGB = (150, 154, 164), (255, 210, 60)
+A_RGB, VARIANT_RGB = (110, 114, 126), (226, 150, 40)
 ROOT = "sweep"
+WIDTH, HEIGHT, LEFT, TOP, BOTTOM = 900, 480, 150, 40, 100  # px of a chart, and of its margins
+_FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 1.1
 
 
 @dataclass(frozen=True)
 class Sweep:
     """Figures of the variants of a setting.
 
-    setting: its name, with its unit; values: of the variants B, C, ...; figures: name with unit -> of A, B, C, ...
+    setting: its name; values: of the variants B, C, ..., as text; figures: name with unit -> of A, B, C, ...
     """
 
     setting: str
-    values: Sequence[float]
+    values: Sequence[str]
     figures: Mapping[str, Sequence[float]]
 
     def log(self, stream: rr.RecordingStream) -> None:
-        """Log a chart for each figure: at each value a bar, and left of it a gray one with the figure of A."""
-        gaps, values = np.diff(np.unique(self.values)), np.array(self.values)
-        width = 0.4 * float(gaps.min()) if gaps.size else 1.0
-        for number, figures in enumerate(self.figures.values()):
-            for side, heights, left, color in (
-                ("a", [figures[0]] * len(values), values - width, A_RGB), ("variants", figures[1:], values, VARIANT_RGB)
-            ):  # fmt: skip
-                bars = rr.BarChart(list(heights), abscissa=left, widths=[width] * len(values), color=color)
-                stream.log(f"{ROOT}/{number}/{side}", bars, static=True)
+        """Log a chart for each figure."""
+        for number, figures in enumerate(self._drawn().values()):
+            picture = png(chart(self.setting, self.values, figures))
+            stream.log(f"{ROOT}/{number}", rr.EncodedImage(contents=picture, media_type="image/png"), static=True)
 
     def views(self) -> rrb.Container:
         """The charts beside each other."""
-        views = [
-            rrb.BarChartView(origin=f"{ROOT}/{number}", name=name, plot_legend=rrb.PlotLegend(visible=False))
-            for number, name in enumerate(self.figures)
-        ]
-        return rrb.Grid(*views, grid_columns=min(4, len(views)), name=f"over {self.setting}; gray: A")
+        views = [rrb.Spatial2DView(origin=f"{ROOT}/{number}", name=name) for number, name in enumerate(self._drawn())]
+        return rrb.Grid(*views, grid_columns=min(4, len(views)), name=f"over {self.setting}")
+
+    def _drawn(self) -> dict[str, Sequence[float]]:
+        """The figures that have a height."""
+        return {name: figures for name, figures in self.figures.items() if any(np.nan_to_num(figures))}
+
+
+def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Array:
+    """A bar for each value of a setting and a line for A, as an RGB picture; figures: of A, B, C, ..."""
+    page = np.full((HEIGHT, WIDTH, 3), PAPER, np.uint8)
+    known = np.nan_to_num(np.array(figures, float))
+    step = _step(float(known.max()))
+    top, bottom, wide = step * max(1, np.ceil(known.max() / step)), HEIGHT - BOTTOM, (WIDTH - LEFT - 70) / len(values)
+
+    def row(figure: float) -> int:
+        return int(bottom - figure / top * (bottom - TOP) + 0.5)
+
+    for figure in np.arange(0.0, top + step / 2, step):
+        cv2.line(page, (LEFT, row(figure)), (WIDTH - 70, row(figure)), (214, 214, 210), 2)
+        _text(page, f"{round(figure, 9):,.6g}", (LEFT - 14, row(figure) + 12), 1.0)
+    widest = max(_width(value) for value in values)
+    for number, (value, figure) in enumerate(zip(values, known[1:], strict=True)):
+        left, right = (round(LEFT + (number + share) * wide) for share in (0.2, 0.8))
+        cv2.rectangle(page, (left, row(figure)), (right, bottom), VARIANT_RGB, cv2.FILLED)
+        if number % int(np.ceil((widest + 24) / wide)) == 0:
+            _text(page, value, ((left + right) // 2, bottom + 42), 0.5)
+    cv2.line(page, (LEFT, row(known[0])), (WIDTH - 70, row(known[0])), A_RGB, 5)
+    _text(page, "A", (WIDTH - 58, row(known[0]) + 12), 0.0)
+    _text(page, setting, (LEFT + (WIDTH - LEFT - 70) // 2, HEIGHT - 14), 0.5)
+    return page
+
+
+def _step(highest: float) -> float:
+    """A round step of an axis that reaches up to `highest` in two to five steps."""
+    power = 10.0 ** np.floor(np.log10(highest / 2))
+    return float(max(step for step in (power, 2 * power, 5 * power) if step <= highest / 2 * (1 + 1e-9)))
+
+
+def _width(text: str) -> int:
+    return int(cv2.getTextSize(text, _FONT, _SIZE, 2)[0][0])
+
+
+def _text(page: Array, text: str, at: tuple[int, int], before: float) -> None:
+    """A line of text at a point; before: the share of the text at the left of the point."""
+    cv2.putText(page, text, (round(at[0] - before * _width(text)), at[1]), _FONT, _SIZE, INK, 2, cv2.LINE_AA)
 
 
 def changed(found: Diff) -> dict[str, float]:

@@ -13,19 +13,32 @@ from recordings.sinks import colormaps
 from stages.data import LEVEL_FRAME, Array, ElevationMap, NavigationMap
 
 MAX_MAP_PX = 900  # maps are enlarged by a whole factor up to that
-MARGIN_PX = 64  # around a picture, for its scales
+PART_PX = 140  # of a picture's width, per MARGIN_STEP of the margin around it, so that letters grow with the picture
+MARGIN_STEP, MIN_STEPS = 16, 4  # px
 INK, PAPER = (38, 40, 46), (250, 250, 248)
 _MAX_OFFSET = 1e-3  # of a cell, by rounding
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
-def page_of(picture: Array, title: str) -> Array:
-    """The picture (H, W, 3) with a margin, and room at the right for a colour bar or legend."""
+def page_of(picture: Array, title: str, beside: int = 3) -> Array:
+    """The picture (H, W, 3) with a margin, and room at the right for a colour bar or legend.
+
+    beside: as many pages beside each other have legible letters in a window 1600 px wide. `margin_of` and what it is
+    used by expect 3.
+    """
     height, width = picture.shape[:2]
-    page = np.full((height + 2 * MARGIN_PX, width + 4 * MARGIN_PX, 3), PAPER, np.uint8)
-    page[MARGIN_PX : MARGIN_PX + height, MARGIN_PX : MARGIN_PX + width] = picture
-    _text(page, title, (MARGIN_PX, MARGIN_PX - 20), 0.8)
+    margin = MARGIN_STEP * max(MIN_STEPS, math.ceil(width * beside / (3 * PART_PX)))
+    page = np.full((height + 2 * margin, width + 4 * margin, 3), PAPER, np.uint8)
+    page[margin : margin + height, margin : margin + width] = picture
+    _text(page, title, (margin, margin * 11 // 16), 0.0125 * margin)
     return page
+
+
+def margin_of(page: Array) -> int:
+    """The width of the margin at the left of the picture and above it, px; it is twice that below and three times at
+    the right."""
+    width = int(page.shape[1])
+    return MARGIN_STEP * max(MIN_STEPS, math.ceil(width / (PART_PX + 4 * MARGIN_STEP)))
 
 
 def with_rover(
@@ -47,17 +60,18 @@ def map_page(rgb: Array, resolution: float, origin: tuple[float, float], title: 
     rows, cols = rgb.shape[:2]
     zoom = max(1, MAX_MAP_PX // max(rows, cols))
     page = page_of(colormaps.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), title)
-    bottom, right = MARGIN_PX + cols * zoom, MARGIN_PX + rows * zoom
+    margin = margin_of(page)
+    bottom, right, unit = margin + cols * zoom, margin + rows * zoom, margin / 64
     for x in _ticks(origin[0], cols * resolution):
         row = round(bottom - (x - origin[0]) / resolution * zoom)
-        cv2.line(page, (MARGIN_PX - 8, row), (MARGIN_PX, row), INK, 2)
-        _text(page, f"{x:g}", (MARGIN_PX - 46, row + 6))
+        cv2.line(page, (round(margin - 8 * unit), row), (margin, row), INK, round(2 * unit))
+        _text(page, f"{x:g}", (round(margin - 46 * unit), round(row + 6 * unit)))
     for y in _ticks(origin[1], rows * resolution):
         col = round(right - (y - origin[1]) / resolution * zoom)
-        cv2.line(page, (col, bottom), (col, bottom + 8), INK, 2)
-        _text(page, f"{y:g}", (col - 12, bottom + 30))
-    _text(page, "x forward, m", (right + 32, bottom + 8))
-    _text(page, "y left, m", (right + 32, bottom + 30))
+        cv2.line(page, (col, bottom), (col, round(bottom + 8 * unit)), INK, round(2 * unit))
+        _text(page, f"{y:g}", (round(col - 12 * unit), round(bottom + 30 * unit)))
+    _text(page, "x forward, m", (round(right + 32 * unit), round(bottom + 8 * unit)))
+    _text(page, "y left, m", (round(right + 32 * unit), round(bottom + 30 * unit)))
     if origin[0] <= 0.0 <= origin[0] + cols * resolution and origin[1] <= 0.0 <= origin[1] + rows * resolution:
         centre = (round(right + origin[1] / resolution * zoom), round(bottom + origin[0] / resolution * zoom))
         cv2.drawMarker(page, centre, (230, 60, 200), cv2.MARKER_TRIANGLE_UP, 16, 3)
@@ -73,30 +87,40 @@ def add_bar(
     others: Mapping[int, tuple[str, colormaps.Rgb]] = MappingProxyType({}),
 ) -> None:  # fmt: skip
     """Draw a vertical colour bar with five values, and below it the colours of unknown and of others."""
-    height, width = page.shape[0] - 2 * MARGIN_PX, page.shape[1]
-    left, top, length = width - 2 * MARGIN_PX - 32, MARGIN_PX, height * 3 // 4
+    margin, left = margin_of(page), _legend_left(page)
+    height, unit, wide = page.shape[0] - 2 * margin, margin / 64, margin * 7 // 16
+    length = min(height * 3 // 4, max(height // 2, height - round((30 + 36 * (1 + len(others))) * unit)))
     ramp = colors(np.linspace(high, low, length))
-    page[top : top + length, left : left + 28] = ramp[:, None]
+    page[margin : margin + length, left : left + wide] = ramp[:, None]
     for share in np.linspace(0.0, 1.0, 5):
-        value = high + share * (low - high)
-        _text(page, colormaps.format_value(value), (left + 36, round(top + share * (length - 1)) + 6))
-    for place, (name, rgb) in enumerate((("unknown", colormaps.UNKNOWN_RGB), *others.values())):
-        _swatch(page, (left, top + length + 20 + 36 * place), name, rgb)
+        place = round(left + 36 * unit), round(margin + share * (length - 1) + 6 * unit)
+        _text(page, colormaps.format_value(high + share * (low - high)), place)
+    for number, (name, rgb) in enumerate((("unknown", colormaps.UNKNOWN_RGB), *others.values())):
+        _swatch(page, round(margin + length + (20 + 36 * number) * unit), name, rgb)
 
 
 def add_legend(page: Array, legend: Mapping[int, tuple[str, colormaps.Rgb]]) -> None:
     """Draw the names and colours of codes at the right."""
-    left = page.shape[1] - 2 * MARGIN_PX - 32
-    for place, (name, rgb) in enumerate(legend.values()):
-        _swatch(page, (left, MARGIN_PX + 44 * place), name, rgb)
+    margin = margin_of(page)
+    for number, (name, rgb) in enumerate(legend.values()):
+        _swatch(page, margin + 11 * margin // 16 * number, name, rgb)
 
 
-def _swatch(page: Array, corner: tuple[int, int], name: str, rgb: colormaps.Rgb) -> None:
-    x, y = corner
-    cv2.rectangle(page, (x, y), (x + 27, y + 27), rgb, cv2.FILLED)
-    cv2.rectangle(page, (x, y), (x + 27, y + 27), INK, 1)
-    _text(page, name, (x + 36, y + 20))
+def _legend_left(page: Array) -> int:
+    return int(page.shape[1]) - margin_of(page) * 5 // 2
 
 
-def _text(page: Array, text: str, at: tuple[int, int], size: float = 0.6) -> None:
-    cv2.putText(page, text, at, _FONT, size, INK, 1, cv2.LINE_AA)
+def _swatch(page: Array, top: int, name: str, rgb: colormaps.Rgb) -> None:
+    left, unit = _legend_left(page), margin_of(page) / 64
+    right, bottom = left + round(27 * unit), top + round(27 * unit)
+    cv2.rectangle(page, (left, top), (right, bottom), rgb, cv2.FILLED)
+    cv2.rectangle(page, (left, top), (right, bottom), INK, round(unit))
+    _text(page, name, (round(left + 36 * unit), round(top + 20 * unit)))
+
+
+def _text(page: Array, text: str, at: tuple[int, int], size: float = 0.0) -> None:
+    """A line of text. size: of the font; 0: that of the page, smaller where its room at the right is too narrow."""
+    size = size or 0.6 * margin_of(page) / 64
+    width = cv2.getTextSize(text, _FONT, size, 1)[0][0]
+    size *= min(1.0, (page.shape[1] - at[0]) / max(1, width))
+    cv2.putText(page, text, at, _FONT, size, INK, max(1, round(1.6 * size)), cv2.LINE_AA)

@@ -42,9 +42,9 @@ def draw(result: Path, out: Path) -> list[Path]:
     return sorted(written)
 
 
-def disparity_page(disparity: Array) -> Array:
-    """Disparities (H, W), px, NaN = unknown, as an RGB page with a colour bar."""
-    limit = colormaps.disparity_limit(disparity)
+def disparity_page(disparity: Array, limit: float | None = None) -> Array:
+    """Disparities (H, W), px, NaN = unknown, as an RGB page with a colour bar from 0 to a limit."""
+    limit = colormaps.disparity_limit(disparity) if limit is None else limit
     page = page_of(colormaps.disparity_colors(disparity, limit), "disparity, px")
     add_bar(page, 0.0, limit, lambda values: colormaps.disparity_colors(values, limit))
     return page
@@ -53,7 +53,12 @@ def disparity_page(disparity: Array) -> Array:
 def elevation_page(terrain: ElevationMap) -> Array:
     """Shaded relief of a terrain as an RGB page with coordinates and a colour bar."""
     terrain = colormaps.terrain_ahead(terrain)
-    low, high = colormaps.elevation_limits(terrain.layers["elevation"])
+    return relief_page(terrain, colormaps.elevation_limits(terrain.layers["elevation"]))
+
+
+def relief_page(terrain: ElevationMap, limits: tuple[float, float]) -> Array:
+    """The same of all of a terrain, with a colour bar over `limits`, m."""
+    low, high = limits
     rgb, origin = with_rover(colormaps.elevation_colors(terrain, (low, high)), terrain, colormaps.UNKNOWN_RGB)
     page = map_page(rgb, terrain.resolution, origin, f"elevation, m ({terrain.frame_id})")
     add_bar(page, low, high, lambda values: colormaps.apply_palette(values, low, high, cv2.COLORMAP_VIRIDIS))
@@ -62,7 +67,11 @@ def elevation_page(terrain: ElevationMap) -> Array:
 
 def navigation_page(navigation: NavigationMap) -> Array:
     """A navigation map as an RGB page with coordinates and a legend."""
-    navigation = colormaps.navigation_ahead(navigation)
+    return verdict_page(colormaps.navigation_ahead(navigation))
+
+
+def verdict_page(navigation: NavigationMap) -> Array:
+    """The same of all of a navigation map."""
     colors, unknown = (
         colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND),
         colormaps.CELL_LEGEND[Cell.UNKNOWN],

@@ -66,7 +66,9 @@ def run(options: argparse.Namespace) -> int:
         recording, tables, differences = DiffRecording(), ["\n\n".join([unchanged, *notes])], dict[str, "Diff"]()
         for label, path in paths.items():
             if label != "A":
-                differences[label] = found = diff(paths["A"], path, recording.of(label))
+                differences[label] = found = diff(
+                    paths["A"], path, recording.of(label, f"{label}: {changes[label][-1]}")
+                )
                 say(f"\n{label}: {', '.join(changes[label])}\n{comparison(found)}")
                 tables += [f"## {label}: {', '.join(changes[label])}", markdown(found)]
         if all(found.equal for found in differences.values()):
@@ -100,22 +102,31 @@ def _errors(paths: dict[str, Path], truth: Path) -> list[list[str]]:
 
 
 def _sweep(
-    setting: tuple[str, list[float]] | None, errors: Sequence[Sequence[str]], differences: Mapping[str, Diff]
+    setting: tuple[str, list[str]] | None, errors: Sequence[Sequence[str]], differences: Mapping[str, Diff]
 ) -> Sweep | None:
-    """The errors, and the numbers of changed pixels and cells, over the values of a setting; None without numbers."""
+    """The errors, and the numbers of changed pixels and cells, over the values of a setting; None without one."""
     from recordings.comparison.sweep import Sweep, changed
 
     if setting is None:
         return None
     head, *rows = errors or [[]]
     figures = {
-        name + (" (%)" if "%" in column[0] else ""): [float(cell.removesuffix(" %")) for cell in column]
+        _with_unit(name, column[0]): [float(cell.removesuffix(" %")) for cell in column]
         for name, *column in list(zip(head, *rows, strict=True))[1:]
     }
     counts = {label: changed(found) for label, found in differences.items()}
     for topic in dict.fromkeys(topic for each in counts.values() for topic in each):
-        figures[f"{topic}, changed"] = [0.0, *(each.get(topic, 0.0) for each in counts.values())]
+        figures[f"{topic}: changed {'pixels' if 'disparity' in topic else 'cells'}"] = [
+            0.0,
+            *(each.get(topic, 0.0) for each in counts.values()),
+        ]
     return Sweep(*setting, figures) if figures else None
+
+
+def _with_unit(name: str, value: str) -> str:
+    """The name of a column with its unit in parentheses."""
+    text, _, unit = name.rpartition(" ")
+    return f"{name} (%)" if "%" in value else f"{text} ({unit})"
 
 
 def _markdown_rows(rows: list[list[str]]) -> list[str]:

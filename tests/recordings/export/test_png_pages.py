@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.errors import LogError
-from recordings.export.page_layout import MARGIN_PX
+from recordings.export.page_layout import margin_of
 from recordings.export.png_pages import disparity_page, draw, elevation_page, navigation_page
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
@@ -59,8 +59,9 @@ def result(tmp_path: Path) -> Path:
 
 def cells_of(page: Array) -> Array:
     """The colours at the middles of the cells of a painted map, (COLS, ROWS, 3): x downwards, y to the left."""
-    zoom = (page.shape[0] - 2 * MARGIN_PX) // COLS
-    return page[MARGIN_PX + zoom // 2 :: zoom, MARGIN_PX + zoom // 2 :: zoom][:COLS, :ROWS]
+    margin = margin_of(page)
+    zoom = (page.shape[0] - 2 * margin) // COLS
+    return page[margin + zoom // 2 :: zoom, margin + zoom // 2 :: zoom][:COLS, :ROWS]
 
 
 def test_ahead_is_up_and_left_is_left():
@@ -91,7 +92,8 @@ def test_terrain_brightens_with_height_and_holes_stay_holes():
 
 
 def test_near_is_red_far_is_blue_unknown_is_neither():
-    picture = disparity_page(disparity().pixels)[MARGIN_PX:, MARGIN_PX:]
+    page = disparity_page(disparity().pixels)
+    picture = page[margin_of(page) :, margin_of(page) :]
     near, far = picture[46, 40].astype(int), picture[8, 40].astype(int)
     assert near[0] > near[2]
     assert far[2] > far[0]
@@ -130,9 +132,8 @@ def test_a_map_without_known_cells_is_drawn():
     nothing = np.full((ROWS, COLS), np.nan, np.float32)
     page = elevation_page(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
     assert (cells_of(page)[:-1] == colormaps.UNKNOWN_RGB).all()
-    assert (
-        disparity_page(nothing)[MARGIN_PX : MARGIN_PX + ROWS, MARGIN_PX : MARGIN_PX + COLS] == colormaps.UNKNOWN_RGB
-    ).all()
+    page, margin = disparity_page(nothing), margin_of(disparity_page(nothing))
+    assert (page[margin : margin + ROWS, margin : margin + COLS] == colormaps.UNKNOWN_RGB).all()
 
 
 def test_light_comes_from_ahead_on_the_left():
