@@ -9,7 +9,8 @@ import pytest
 from flow.cli.fleet.catalogue import Catalogue
 from flow.cli.fleet.engine import Fleet
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
-from flow.cli.fleet.task import Pipeline, Task, run_task
+from flow.cli.fleet.progress import Progress
+from flow.cli.fleet.task import Pipeline, Task, run_task, unfit
 from flow.errors import UsageError
 from recordings.simulator import Simulation, write_log
 from tests.conftest import roverflow
@@ -105,6 +106,8 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, c
     assert json.loads(rows_of(out)["a"]["scores"])["density"] > 0
     assert roverflow("fleet", "--out", out, "--watch") == 0
     assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in capsys.readouterr().out
+    assert roverflow("list", out, "--where", "verdict != 'COMPLETE'", "--csv") == 0
+    assert [line.split(",")[0] for line in capsys.readouterr().out.splitlines()] == ["name", "junk"]
     assert roverflow("report", out) == 0
     page = (out / "report.html").read_text()
     assert "<td>site/c</td><td>COMPLETE</td><td>1 of 1</td>" in page
@@ -116,11 +119,51 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, c
 def test_a_progress_file_that_is_just_being_written_is_no_stall(logs, tmp_path):
     (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
     task = Task(job.name, job.log, job.digest, job.result(tmp_path), Pipeline.of("fast", ()), False, workers=1)
-    fleet = Fleet(tmp_path, Catalogue(tmp_path, create=True), {"a": (job, task)}, print, left={"a"})
-    task.progress.touch()
-    for _ in range(2):
+    progress = Progress({"a": job.size})
+    fleet = Fleet(tmp_path, Catalogue(tmp_path, create=True), {"a": (job, task)}, progress, left={"a"})
+    fleet.catalogue.put("a", {"state": "waiting"})
+    for content, state in (("", "waiting"), ("1", "running"), ("", "running")):
+        task.progress.write_text(content)
         fleet._watch(None, {object(): "a"})
-        assert {name: row["state"] for name, row in rows_of(tmp_path).items()} == {"a": "running"}
+        assert rows_of(tmp_path)["a"]["state"] == state
+
+
+def test_a_log_keeps_its_name_and_no_other_log_takes_it(logs, tmp_path):
+    (first,) = jobs_of([str(logs / "site")], tmp_path)
+    row = {"name": first.name, "log": str(first.log), "log_digest": first.digest}
+    assert first.name == "c"
+    assert [job.name for job in jobs_of([str(logs)], tmp_path, [row])] == ["b", "a", "c", "junk"]
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    (moved / "c.mcap").write_bytes(first.log.read_bytes())
+    assert [job.name for job in jobs_of([str(moved)], tmp_path, [row])] == ["c"]
+    (moved / "c.mcap").write_bytes((logs / "b.mcap").read_bytes())
+    with pytest.raises(UsageError, match=r"has results of .*site/c.mcap by the name c; choose another --out"):
+        jobs_of([str(moved)], tmp_path, [row])
+
+
+def test_a_second_fleet_in_the_folder_is_refused(logs, tmp_path, capsys):
+    with Catalogue(tmp_path, create=True).held():
+        assert roverflow("fleet", logs / "a.mcap", "--out", tmp_path, *PIPELINE) == 2
+    assert f"another roverflow fleet runs in {tmp_path}; --watch shows it" in capsys.readouterr().err
+    assert Catalogue(tmp_path).is_held() is False
+
+
+def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, capsys):
+    catalogue = Catalogue(tmp_path, create=True)
+    catalogue.put("a", {"state": "running", "bytes": 9})
+    assert roverflow("fleet", "--out", tmp_path, "--watch") == 3
+    assert "no process runs this fleet, 1 log left; the same command continues" in capsys.readouterr().out
+
+
+def test_a_worker_that_stays_forgets_the_stages_of_an_earlier_fleet(logs, tmp_path):
+    (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
+    task = Task(job.name, job.log, job.digest, job.result(tmp_path), Pipeline.of("fast", ()), False, workers=1)
+    text = TRAPPED.replace("trap.Trap", "travelled_trap.Trap").encode()
+    for code, refused in ((TRAP, ""), ("", "cannot load the pipeline"), (TRAP, "")):
+        files = {"own.yaml": text, "travelled_trap.py": code.encode()}
+        assert unfit(replace(task, pipeline=Pipeline("own.yaml", files, ()))).startswith(refused)
+        assert bool(unfit(replace(task, pipeline=Pipeline("own.yaml", files, ())))) == bool(refused)
 
 
 def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,9 +16,10 @@ from flow.errors import COMPLETE, INCOMPLETE, UsageError
 
 if TYPE_CHECKING:
     from flow.cli.fleet.catalogue import Catalogue
+    from flow.cli.fleet.jobs import Job
+    from flow.cli.fleet.task import Pipeline
 
 HELP = "run many logs through a pipeline, and keep a catalogue of their results"
-WATCH_SECONDS = 2.0
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -42,23 +42,35 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run what is missing, changed or failed; the exit code is 3 unless every log is COMPLETE."""
-    from flow.cli.fleet.catalogue import Catalogue
-
-    if options.watch:
-        return _watch(Catalogue(options.out))
-    from flow.cli.fleet.engine import Fleet, cluster, tasks_of
-    from flow.cli.fleet.jobs import jobs_of, reason_to_run
+    from flow.cli.fleet.catalogue import NAME, Catalogue
+    from flow.cli.fleet.jobs import jobs_of
+    from flow.cli.fleet.progress import watch
     from flow.cli.fleet.task import Pipeline
-    from flow.cli.replay import product_version
     from flow.config.loader import load
 
+    if options.watch:
+        return watch(Catalogue(options.out))
     if not options.logs:
         raise UsageError("give logs, folders, patterns or a text file of them")
     load(options.pipeline, options.set)
     pipeline, folder = Pipeline.of(options.pipeline, tuple(options.set)), options.out.absolute()
-    jobs = jobs_of(options.logs, folder)
+    jobs = jobs_of(options.logs, folder, Catalogue(folder).rows() if (folder / NAME).is_file() else ())
     folder.mkdir(parents=True, exist_ok=True)
     catalogue = Catalogue(folder, create=True)
+    with catalogue.held():
+        _run_due(options, jobs, pipeline, catalogue)
+    names = {job.name for job in jobs}
+    return _verdict([row for row in catalogue.rows() if row["name"] in names], options.out)
+
+
+def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipeline, catalogue: Catalogue) -> None:
+    """Say which jobs have to run, and why, and run them."""
+    from flow.cli.fleet.engine import Fleet, cluster, tasks_of
+    from flow.cli.fleet.jobs import reason_to_run
+    from flow.cli.fleet.progress import Progress
+    from flow.cli.replay import product_version
+
+    folder = catalogue.path.parent
     rows = {row["name"]: row for row in catalogue.rows()}
     why = {job: reason_to_run(job, rows.get(job.name), pipeline.digest, product_version(), folder) for job in jobs}
     due = [job for job, reason in why.items() if reason]
@@ -66,14 +78,15 @@ def run(options: argparse.Namespace) -> int:
     size, listed = sum(job.size for job in due) / 1e9, ", ".join(f"{n} {reason}" for reason, n in reasons.items())
     more = f" ({listed}), {size:.2f} GB" if due else ""
     say(f"{counted(len(jobs), 'log')}: {len(jobs) - len(due)} done before, {len(due)} to run{more}")
-    if due:
-        tasks = tasks_of(due, folder, pipeline, options.rrd, options.workers_per_log)
-        processes = options.processes or max(1, (os.cpu_count() or 1) // options.workers_per_log)
-        fleet = Fleet(folder, catalogue, tasks, say, stall_seconds=options.stall)
-        with cluster(options.cluster, min(processes, len(due)), options.memory, options.dashboard) as client:
-            fleet.run(client)
-    names = {job.name for job in jobs}
-    return _verdict([row for row in catalogue.rows() if row["name"] in names], options.out)
+    if not due:
+        return
+    tasks = tasks_of(due, folder, pipeline, options.rrd, options.workers_per_log)
+    processes = options.processes or max(1, (os.cpu_count() or 1) // options.workers_per_log)
+    with (
+        cluster(options.cluster, min(processes, len(due)), options.memory, options.dashboard) as client,
+        Progress({job.name: job.size for job in due}) as progress,
+    ):
+        Fleet(folder, catalogue, tasks, progress, stall_seconds=options.stall).run(client)
 
 
 def _verdict(rows: list[dict[str, object]], folder: Path) -> int:
@@ -84,32 +97,3 @@ def _verdict(rows: list[dict[str, object]], folder: Path) -> int:
         + f"; roverflow list {folder} lists them"
     )
     return COMPLETE if set(ended) <= {"COMPLETE"} else INCOMPLETE
-
-
-def _watch(catalogue: Catalogue) -> int:
-    """Print each log that ends, and the states whenever they change, until nothing waits or runs."""
-    from flow.cli.fleet.engine import line_of
-    from recordings.containers.finding import RESULT_ENDING
-
-    shown, known = "", {row["name"]: row["ended"] for row in catalogue.rows()}
-    while True:
-        rows = catalogue.rows(sort="ended, name")
-        active = [row for row in rows if row["state"] in ("waiting", "running")]
-        for row in rows:
-            if row not in active and row["ended"] != known.get(row["name"]):
-                say(f"{row['name']}: {line_of(row)}")
-                known[row["name"]] = row["ended"]
-        frames = sum(row["frames"] or 0 for row in rows if row not in active)
-        for row in active:
-            with suppress(OSError, ValueError):  # it has not begun, or ends just now
-                progress = catalogue.path.parent / f"{row['name']}{RESULT_ENDING}.progress"
-                frames += int(progress.read_text()) - 1
-        states = [str(row["state"]) for row in rows]
-        line = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(sorted(states)))
-        line += f"; {counted(frames, 'frame')} so far, {sum(row['bytes'] for row in active) / 1e9:.2f} GB left"
-        if line != shown:
-            say(line)
-            shown = line
-        if not active:
-            return COMPLETE
-        time.sleep(WATCH_SECONDS)

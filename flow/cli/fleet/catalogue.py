@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import sqlite3
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from flow.errors import UsageError
-from recordings.atomic_write import unwritable
+from recordings.atomic_write import unwritable, writing
 
 NAME = "catalogue.sqlite"
 # state: waiting, running, done, unusable (a run refuses the log), failed, killed (it ends its workers), hung
@@ -21,6 +24,9 @@ COLUMNS = {
     "cpu_seconds": "REAL", "stage_seconds": "REAL", "node": "TEXT", "result": "TEXT", "why": "TEXT", "ended": "TEXT",
 }  # fmt: skip
 ENDED = ("done", "unusable", "killed", "hung")  # states that a second call leaves, unless log or pipeline change
+# Of a log that has not ended. The verdict is no NULL, so that "verdict != 'COMPLETE'" finds the log.
+WAITING = dict.fromkeys(list(COLUMNS)[8:]) | {"state": "waiting", "verdict": ""}
+HOLD_SECONDS = 2.0  # for which a client waits for --watch, which holds the lock for an instant
 
 
 class Catalogue:
@@ -82,6 +88,34 @@ class Catalogue:
                 database.execute(query, [_plain(value) for value in known.values()])
 
     @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold the folder, if its file system has locks. Raises UsageError if another client does."""
+        with writing(self._lock):
+            file = os.open(self._lock, os.O_CREAT | os.O_RDWR, 0o644)
+        try:
+            end = time.monotonic() + HOLD_SECONDS
+            while _locked(file, fcntl.LOCK_EX) is False:
+                if time.monotonic() > end:
+                    raise UsageError(f"another roverflow fleet runs in {self.path.parent}; --watch shows it")
+                time.sleep(HOLD_SECONDS / 20)
+            yield
+        finally:
+            os.close(file)
+
+    def is_held(self) -> bool | None:
+        """Whether a client holds the folder; None if its file system has no locks."""
+        try:
+            with self._lock.open() as file:
+                locked = _locked(file.fileno(), fcntl.LOCK_SH)
+        except FileNotFoundError:
+            return False
+        return None if locked is None else not locked
+
+    @property
+    def _lock(self) -> Path:
+        return self.path.with_suffix(".lock")
+
+    @contextmanager
     def _opened(self, write: bool = False) -> Iterator[sqlite3.Connection]:
         mode = "rwc" if write else "ro"
         database = sqlite3.connect(f"file:{self.path.resolve()}?mode={mode}", uri=True, timeout=30)
@@ -107,6 +141,17 @@ def as_table(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells
     )
+
+
+def _locked(file: int, kind: int) -> bool | None:
+    """Whether a file could be locked; None where the file system has no locks."""
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return None
+    return True
 
 
 def _plain(value: Any) -> Any:

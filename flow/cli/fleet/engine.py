@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.catalogue import WAITING, Catalogue
 from flow.cli.fleet.jobs import Job
-from flow.cli.fleet.task import Task, about_worker, run_task
+from flow.cli.fleet.progress import Progress, frames_so_far
+from flow.cli.fleet.task import Task, about_worker, run_task, unfit
 from flow.errors import INCOMPLETE, RoverflowError, UsageError
 
 POLL_SECONDS = 1.0
+WORKER_SECONDS = 20.0  # for which a fleet waits for the first worker of a cluster
 WORKER_DEATHS = 1  # of a log that is tried once more; the next death sets it aside
 
 
@@ -33,25 +35,19 @@ class Fleet:
     folder: Path
     catalogue: Catalogue
     tasks: dict[str, tuple[Job, Task]]
-    say: Callable[[str], None]
+    progress: Progress
     stall_seconds: float = 600.0
     left: set[str] = field(default_factory=set)
     _again: set[str] = field(default_factory=set)  # whose workers died
-    _seen: dict[str, tuple[str, float]] = field(default_factory=dict)  # name -> progress and when it was new
-    _begun: float = 0.0
-    _bytes_left: int = 0
-    _frames: int = 0
+    _seen: dict[str, tuple[int, float]] = field(default_factory=dict)  # name -> frames and when they were new
 
     def run(self, client: Any) -> None:
         """Run all tasks, the largest first; raises ClusterLostError where the scheduler is gone."""
         from distributed import as_completed
 
         self._check(client)
-        same = next(iter(self.tasks.values()))[1].identity() | {"state": "waiting", "why": None, "scores": None}
-        waiting = {name: same | _row_of(job, task) for name, (job, task) in self.tasks.items()}
-        self.catalogue.put_all(waiting)
-        self.left, self._begun = set(self.tasks), time.monotonic()
-        self._bytes_left = sum(job.size for job, _ in self.tasks.values())
+        self.catalogue.put_all({name: _waiting(job, task) for name, (job, task) in self.tasks.items()})
+        self.left = set(self.tasks)
         futures = {self._submit(client, name, place): name for place, name in enumerate(self.tasks)}
         ended, looked = as_completed(futures), 0.0
         while self.left:
@@ -80,27 +76,36 @@ class Fleet:
         return client.submit(run_task, task, key=key, priority=-place, pure=False)
 
     def _check(self, client: Any) -> None:
-        """Refuse workers of another version, pipeline or machine, and logs that a worker does not see."""
+        """Refuse workers of another version, pipeline or machine, and those that do not see the logs or the stages."""
         _, task = next(iter(self.tasks.values()))
+        with suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=WORKER_SECONDS)
         found = client.run(about_worker, task)
         if not found:
             raise UsageError("the cluster has no workers; start some")
         expected = about_worker(task)
         for worker, about in found.items():
-            for name in ("version", "pipeline", "machine"):
-                if about[name] != expected[name]:
-                    here, there = expected[name], about[name]
-                    raise UsageError(f"the worker {worker} has another {name} ({there}) than this machine ({here})")
-            if not about["log"]:
-                raise UsageError(f"the worker {worker} has no {task.log}; paths must mean the same on all machines")
+            for name, here in expected.items():
+                if about[name] != here and name != "processor":
+                    raise UsageError(
+                        f"the worker {worker} has another {name} ({about[name]}) than this machine ({here})"
+                    )
+        for worker, why in client.run(unfit, task).items():
+            if why:
+                raise UsageError(f"the worker {worker} {why}")
+        processors = sorted({about["processor"] for about in found.values()})
+        if len(processors) > 1:
+            self.progress.say(f"the workers have different processors ({', '.join(processors)}); last bits may differ")
 
     def _end(self, client: Any, name: str, future: Any) -> tuple[Any, str] | None:
         """Write the row of a task that has ended; returns its future and name if it is tried once more."""
         if name not in self.left:
             return None
-        job, _ = self.tasks[name]
+        job, task = self.tasks[name]
         if future.status == "finished":
             row = dict(future.result())
+            if any(row[name] != value for name, value in task.identity().items()):  # a worker that came later
+                row = {"state": "failed", "why": f"{row['node']} has another version of roverflow or of the pipeline"}
         elif future.status != "error":  # the scheduler forgot it
             raise ClusterLostError("the scheduler lost its tasks; the same command continues where this one ended")
         else:
@@ -108,7 +113,7 @@ class Fleet:
             dead = type(error).__name__ == "KilledWorker"
             if dead and name not in self._again:
                 self._again.add(name)
-                self.say(f"{name}: its workers died; it is tried once more after the others")
+                self.progress.say(f"{name}: its workers died; it is tried once more after the others")
                 return self._submit(client, name, len(self.tasks)), name
             why = (
                 "its workers died, by memory or a fault of the machine" if dead else f"{type(error).__name__}: {error}"
@@ -123,33 +128,28 @@ class Fleet:
         """Write a row for good, and say what is left."""
         self.left.discard(name)
         self.catalogue.put(name, row | {"ended": datetime.now(UTC).isoformat(timespec="seconds")})
-        self._bytes_left -= self.tasks[name][0].size
-        self._frames += row.get("frames") or 0
-        done = sum(job.size for job, _ in self.tasks.values()) - self._bytes_left
-        line = f"{len(self.tasks) - len(self.left)} of {len(self.tasks)}: {name}: {line_of(row)}"
-        if self.left:
-            seconds = (time.monotonic() - self._begun) * self._bytes_left / max(done, 1)
-            line += f"; {self._frames} frames so far, {self._bytes_left / 1e9:.2f} GB left, about {duration(seconds)}"
-        self.say(line)
+        self.progress.end(name, row)
 
     def _watch(self, client: Any, futures: dict[Any, str]) -> None:
         """Note which tasks run, and set aside those without progress."""
-        now, running = time.monotonic(), dict[str, dict[str, Any]]()
-        for future, name in list(futures.items()):
-            try:
-                progress = self.tasks[name][1].progress.read_text()
-            except OSError:
-                continue  # it has not begun, or it ends just now
+        now, running = time.monotonic(), dict[str, int]()
+        begun = set[str]()
+        for future, name in [item for item in futures.items() if item[1] in self.left]:
+            frames = frames_so_far(self.tasks[name][1].progress)
+            if frames is None:
+                continue
+            running[name] = frames
             seen = self._seen.get(name)
             if seen is None:
-                running[name] = {"state": "running"}
-            if seen is None or seen[0] != progress:
-                self._seen[name] = (progress, now)
-            elif now - seen[1] > self.stall_seconds and name in self.left:
-                self._set_aside(client, name, future, progress)
-        self.catalogue.put_all({name: row for name, row in running.items() if name in self.left})
+                begun.add(name)
+            if seen is None or seen[0] != frames:
+                self._seen[name] = (frames, now)
+            elif now - seen[1] > self.stall_seconds:
+                self._set_aside(client, name, future, frames)
+        self.catalogue.put_all({name: {"state": "running"} for name in begun & self.left})
+        self.progress.show(running)
 
-    def _set_aside(self, client: Any, name: str, future: Any, progress: str) -> None:
+    def _set_aside(self, client: Any, name: str, future: Any, frames: int) -> None:
         """Restart the worker of a task without progress; one that waits for a worker again is left."""
         holders = [worker for worker, keys in client.processing().items() if future.key in map(str, keys)]
         with suppress(OSError):
@@ -160,29 +160,14 @@ class Fleet:
         future.cancel(force=True)
         with suppress(Exception):  # the worker may die on its own
             client.restart_workers(holders, timeout=30, raise_for_error=False)
-        frame = f", after frame {int(progress) - 1}" if progress.isdigit() else ""
-        self._note(name, {"state": "hung", "why": f"no frame in {self.stall_seconds:g} s{frame}"})
+        why = f"no frame in {self.stall_seconds:g} s, after frame {frames}"
+        self._note(name, {"state": "hung", "why": why})
 
 
-def duration(seconds: float) -> str:
-    """A time that is left, in its natural unit."""
-    for unit, size in (("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.0f} s"
-
-
-def line_of(row: dict[str, Any]) -> str:
-    """One line about a log that has ended."""
-    if row["state"] != "done":
-        return f"{row['state']}: {row['why']}"
-    why = f", {row['why']}" if row.get("why") else ""
-    frames = f"{row['complete']} of {row['frames']} frames{why}"
-    return f"{row['verdict']}, {frames}; {row['seconds']:.0f} s on {row['node']}"
-
-
-def _row_of(job: Job, task: Task) -> dict[str, Any]:
-    return {"log": str(job.log), "log_digest": job.digest, "bytes": job.size, "pipeline": task.pipeline.name}
+def _waiting(job: Job, task: Task) -> dict[str, Any]:
+    """The row of a log that waits."""
+    row = WAITING | task.identity()
+    return row | {"log": str(job.log), "bytes": job.size, "pipeline": task.pipeline.name}
 
 
 @contextmanager

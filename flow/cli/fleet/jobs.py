@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
@@ -30,20 +30,29 @@ class Job:
         return folder / f"{self.name}{RESULT_ENDING}.mcap"
 
 
-def jobs_of(given: Sequence[str], folder: Path) -> list[Job]:
+def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, Any]] = ()) -> list[Job]:
     """The jobs of logs, folders of logs, patterns, and text files that list these; the largest first.
 
-    A folder that is one recording is one job. Raises UsageError if there is no log.
+    A folder that is one recording is one job. A log of the catalogue's rows keeps its name, whatever else is given.
+    Raises UsageError if there is no log, or if a log has the name of another one.
     """
     logs = list(dict.fromkeys(path.absolute() for word in given for path in _logs(word, folder)))
     if not logs:
         raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, patterns or a text file of them")
     root = Path(os.path.commonpath([log.parent for log in logs]))
-    jobs = [_job(log, root) for log in logs]
+    known = {row["log"]: row["name"] for row in rows}
+    jobs = [_job(log, root, known.get(str(log))) for log in logs]
     names = [job.name for job in jobs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise UsageError(f"two logs have the name {twice[0]}; give them in different folders, or rename one")
+    digests = {row["name"]: row["log_digest"] for row in rows}
+    for job in jobs:
+        if str(job.log) not in known and digests.get(job.name, job.digest) != job.digest:
+            other = next(log for log, name in known.items() if name == job.name)
+            raise UsageError(
+                f"{folder} has results of {other} by the name {job.name}; choose another --out, or rename {job.log}"
+            )
     return sorted(jobs, key=lambda job: (-job.size, job.name))
 
 
@@ -104,12 +113,12 @@ def _in_folder(path: Path, folder: Path) -> Iterable[Path]:
             yield item
 
 
-def _job(log: Path, root: Path) -> Job:
+def _job(log: Path, root: Path, name: str | None) -> Job:
     files = find_files(log).files
-    name = log.relative_to(root)
+    beside = log.relative_to(root)
     try:
         digest = log_digest(files)
         size = sum(file.stat().st_size for file in files)
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror or error}") from error
-    return Job((name if log.is_dir() else name.with_suffix("")).as_posix(), log, size, digest)
+    return Job(name or (beside if log.is_dir() else beside.with_suffix("")).as_posix(), log, size, digest)

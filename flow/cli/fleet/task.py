@@ -6,10 +6,12 @@ import hashlib
 import json
 import os
 import platform
+import sys
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,8 @@ from flow.errors import RoverflowError, UsageError
 from recordings.errors import LogError, UnwritableError
 
 MAX_FILE_BYTES = 4 << 20  # of a file beside a pipeline that travels with it
+LIBRARIES = ("numpy", "opencv-python-headless", "numba", "scikit-image", "scipy")  # that decide the bits of a result
+_TRAVELLED = f"roverflow-{os.getuid()}-"  # begins the names of folders of pipelines that travelled
 
 
 @dataclass(frozen=True)
@@ -54,8 +58,9 @@ class Pipeline:
         """Its name or file on this machine."""
         if not self.files:
             return self.name
-        folder = Path(tempfile.gettempdir()) / f"roverflow-{os.getuid()}-{self.digest}"
+        folder = Path(tempfile.gettempdir()) / f"{_TRAVELLED}{self.digest}"
         folder.mkdir(mode=0o700, exist_ok=True)
+        _forget_others(folder)
         for name, data in self.files.items():
             file = folder / name
             if not file.exists() or file.read_bytes() != data:
@@ -63,6 +68,15 @@ class Pipeline:
                 partial.write_bytes(data)
                 partial.replace(file)
         return str(folder / self.name)
+
+
+def _forget_others(folder: Path) -> None:
+    """Forget modules that travelled with other pipelines: a worker that stays has them from an earlier fleet."""
+    for name, module in list(sys.modules.items()):
+        home = Path(getattr(module, "__file__", None) or "").parent
+        if home.name.startswith(_TRAVELLED) and home.name != folder.name:
+            del sys.modules[name]
+    sys.path[:] = [path for path in sys.path if not Path(path).name.startswith(_TRAVELLED) or path == str(folder)]
 
 
 @dataclass(frozen=True)
@@ -167,9 +181,21 @@ def _finished(task: Task) -> dict[str, Any] | None:
     return row if same and row["state"] == "done" and (row["result"] is None or task.result.is_file()) else None
 
 
-def about_worker(task: Task) -> dict[str, Any]:
-    """What must be the same on all workers, and whether the log is there."""
-    return {
-        "version": product_version(), "pipeline": task.pipeline.digest, "machine": platform.machine(),
-        "python": platform.python_version(), "log": task.log.exists(),
-    }  # fmt: skip
+def about_worker(task: Task) -> dict[str, str]:
+    """What must be the same on all workers, and the processor, which should be."""
+    from llvmlite import binding
+
+    libraries = {name: version(name) for name in LIBRARIES}
+    target = {"numba target": binding.get_process_triple(), "processor": binding.get_host_cpu_name()}
+    return {"version": product_version(), "pipeline": task.pipeline.digest} | libraries | target
+
+
+def unfit(task: Task) -> str:
+    """Why this machine cannot run a task, or nothing."""
+    if not task.log.exists():
+        return f"has no {task.log}; paths must mean the same on all machines"
+    try:
+        load(task.pipeline.local(), task.pipeline.changes)
+    except RoverflowError as error:
+        return f"cannot load the pipeline: {error}"
+    return ""

@@ -1,0 +1,145 @@
+"""What a fleet shows while it runs: a line for each log that ends, and on a terminal a bar."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Any
+
+from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.report import say
+from flow.contracts import counted
+from flow.errors import COMPLETE, INCOMPLETE
+from recordings.containers.finding import RESULT_ENDING
+
+WATCH_SECONDS = 2.0
+
+
+class Progress(AbstractContextManager["Progress"]):
+    """Logs, frames and bytes of a fleet.
+
+    Parameters
+    ----------
+    left : mapping
+        Name -> bytes of each log that has not ended.
+    logs, frames : int
+        The logs that have ended before, and their frames.
+    """
+
+    def __init__(self, left: Mapping[str, int], logs: int = 0, frames: int = 0) -> None:
+        from tqdm import tqdm
+
+        self._left, self._ended, self._all = dict(left), logs, logs + len(left)
+        self._frames, self._frames_before, self._size = frames, frames, sum(left.values())
+        self._running: Mapping[str, int] = {}
+        self._begun = time.monotonic()
+        hidden = not sys.stderr.isatty()
+        self._bar = tqdm(total=self._size, unit="B", unit_scale=True, smoothing=0, disable=hidden)
+
+    def __exit__(self, *error: object) -> None:
+        self._bar.close()
+
+    def say(self, text: str) -> None:
+        """Print a line above the bar."""
+        with self._bar.external_write_mode():
+            say(text)
+
+    def show(self, running: Mapping[str, int]) -> None:
+        """Move the bar; running: name -> frames so far of each log that runs."""
+        self._running = running
+        self._bar.n = round(self._size - self._bytes_left())
+        frames = self._frames + sum(running.values())
+        self._bar.set_postfix_str(f"{self._ended} of {counted(self._all, 'log')}, {counted(frames, 'frame')}")
+
+    def end(self, name: str, row: Mapping[str, Any]) -> None:
+        """Print the line of a log that has ended."""
+        self._left.pop(name, None)
+        self._ended += 1
+        self._frames += row.get("frames") or 0
+        line = f"{self._ended} of {self._all}: {name}: {line_of(row)}"
+        if left := self._bytes_left():
+            seconds = (time.monotonic() - self._begun) * left / (self._size - left)
+            line += f"; {self._frames} frames so far, {left / 1e9:.2f} GB left, about {duration(seconds)}"
+        self.say(line)
+
+    def _bytes_left(self) -> float:
+        """Bytes that are not read yet, by the mean size of the frames of logs that have ended."""
+        left, frames = sum(self._left.values()), self._frames - self._frames_before
+        size = (self._size - left) / frames if frames else 0.0
+        return left - sum(min(size * self._running.get(name, 0), whole) for name, whole in self._left.items())
+
+
+def watch(catalogue: Catalogue) -> int:
+    """Show a fleet of another process until its logs have ended; the exit code is 3 if the process ends before."""
+    rows = _rows(catalogue)
+    while not _active(rows) and catalogue.is_held():  # it starts
+        time.sleep(WATCH_SECONDS / 10)
+        rows = _rows(catalogue)
+    say(_states(rows))
+    left = {name: row["bytes"] for name, row in _active(rows).items()}
+    frames = sum(row["frames"] or 0 for row in rows.values())
+    with Progress(left, len(rows) - len(left), frames) as progress:
+        while left:
+            held = catalogue.is_held()  # before the rows, so that these are the last ones of a process that ended
+            rows = _rows(catalogue)
+            for name in left.keys() - _active(rows).keys():
+                progress.end(name, rows[name])
+                del left[name]
+            progress.show({name: frames_so_far(_progress_file(catalogue, name)) or 0 for name in left})
+            if left and held is False:
+                progress.say(
+                    f"no process runs this fleet, {counted(len(left), 'log')} left; the same command continues"
+                )
+                return INCOMPLETE
+            time.sleep(WATCH_SECONDS if left else 0.0)
+    say(_states(rows))
+    return COMPLETE
+
+
+def frames_so_far(file: Path) -> int | None:
+    """The frames of a log that runs, by its file; None if it has not begun, or ends or writes just now."""
+    try:
+        return int(file.read_text()) - 1
+    except (OSError, ValueError):
+        return None
+
+
+def line_of(row: Mapping[str, Any]) -> str:
+    """One line about a log that has ended."""
+    if row["state"] != "done":
+        return f"{row['state']}: {row['why']}"
+    why = f", {row['why']}" if row.get("why") else ""
+    frames = f"{row['complete']} of {row['frames']} frames{why}"
+    return f"{row['verdict']}, {frames}; {row['seconds']:.0f} s on {row['node']}"
+
+
+def duration(seconds: float) -> str:
+    """A time that is left, in its natural unit."""
+    for unit, size in (("h", 3600), ("min", 60)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def _rows(catalogue: Catalogue) -> dict[str, dict[str, Any]]:
+    return {row["name"]: row for row in catalogue.rows(sort="ended, name")}
+
+
+def _active(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {name: row for name, row in rows.items() if row["state"] in ("waiting", "running")}
+
+
+def _progress_file(catalogue: Catalogue, name: str) -> Path:
+    return catalogue.path.parent / f"{name}{RESULT_ENDING}.progress"
+
+
+def _states(rows: Mapping[str, dict[str, Any]]) -> str:
+    """How many logs have which state, with the frames of those that have ended and the bytes of the others."""
+    states = [str(row["state"]) for row in rows.values()]
+    line = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(sorted(states)))
+    frames = sum(row["frames"] or 0 for row in rows.values())
+    left = sum(row["bytes"] for row in _active(rows).values())
+    return f"{line}; {counted(frames, 'frame')} so far, {left / 1e9:.2f} GB left"
