@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -24,6 +25,8 @@ FRAME = "frame"  # the timeline that counts frames
 
 LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "seconds", "queues"
 LAYOUT = "layout"  # the text from which other desks are made
+CURVES = "curves"  # the names of the curves of a panel, which stand beside the plot
+LEDGER_CHARS = 80  # of a line of the ledger, which the viewer does not wrap
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
 SHOWN_LAYERS = (
     "step",
@@ -33,6 +36,7 @@ SHOWN_LAYERS = (
     "variance",
 )  # side by side on the desk `terrain`; the others are tabs
 
+_HIDDEN = rrb.PlotLegend(visible=False)
 Specs = tuple["ViewSpec", ...]
 _Part = rrb.View | rrb.Container
 
@@ -51,7 +55,7 @@ SENSOR_PLOTS = (
     (Panel.ANGLE, "tilt (degrees)"),
     (Panel.HEALTH, "tilt check (degrees)"),
     (Panel.MATCHES, MATCHED),
-    (Panel.FEATURES, "odometry"),
+    (Panel.FEATURES, "features of visual odometry"),
 )
 
 
@@ -129,7 +133,7 @@ def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
         *_image_tabs(drawn), _tabs(_flat_views(drawn, Panel.DIFFERENCE)), _tabs(reversed(_superpixels(drawn))),
         _tabs(disparities[-2::-1]), _tabs(disparities[-1:]), _tabs(sources[-2::-1]), _tabs(sources[-1:]),
         *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.MATCH_CONFIDENCE, Panel.CONFIDENCE, Panel.SIGMA)),
-        _plot(_at(drawn, Panel.MATCHES), MATCHED),
+        _panel(drawn, Panel.MATCHES, MATCHED, in_tab=False),
     ]  # fmt: skip
     return _grid(parts, 4) or _ledger(drawn)
 
@@ -147,14 +151,14 @@ def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
 
 def _runtime(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """Times of stages and sinks, queues, and all that was lost."""
-    plots = _stack(part for part, _ in _stage_plots(drawn, slowest))
+    plots = _stack(map(_tabs, _stage_plots(drawn, slowest)))
     texts = _stack([*_texts(drawn)[:2], _summary()])
     return _row((plots, 3.0), (texts, 2.0)) or _ledger(drawn)
 
 
 def _tilt(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """The readings, their residuals in the images, and the cloud that is levelled by them."""
-    plots = [_plot(_at(drawn, panel), title) for panel, title in SENSOR_PLOTS]
+    plots = [_panel(drawn, panel, title, in_tab=False) for panel, title in SENSOR_PLOTS]
     space = _stack([*_image_tabs(drawn)[:1], _tabs(_spaces(drawn, Panel.CLOUD, "cloud")), _tabs(_trajectories(drawn))])
     return _row((space, 2.0), (_stack([*plots[:2], plots[3], _ledger(drawn)]), 3.0)) or _ledger(drawn)
 
@@ -286,27 +290,42 @@ def _maps(drawn: Specs) -> _Part | None:
     return _stack([_tabs([*reliefs, *layers]), _tabs([*maps, *reasons])])
 
 
-def _plot(specs: Iterable[ViewSpec], title: str) -> rrb.View | None:
+def _plot(specs: Iterable[ViewSpec], title: str, **options: Any) -> rrb.View | None:
     """The numbers of these specs over time."""
     contents = [f"+ /{spec.path}/**" for spec in specs]
-    legend = rrb.PlotLegend("LeftTop")
-    return rrb.TimeSeriesView(origin="/", contents=contents, name=title, plot_legend=legend) if contents else None
+    options = {"plot_legend": rrb.PlotLegend("LeftTop")} | options
+    return rrb.TimeSeriesView(origin="/", contents=contents, name=title, **options) if contents else None
+
+
+def _panel(drawn: Specs, panel: Panel, title: str, in_tab: bool) -> _Part | None:
+    """The numbers of a panel over time."""
+    specs = _at(drawn, panel)
+    return _plot(specs, title, plot_legend=_HIDDEN) if panel is Panel.FEATURES else _named(specs, title, panel, in_tab)
+
+
+def _named(specs: Iterable[ViewSpec], title: str, panel: Panel, in_tab: bool) -> _Part | None:
+    """Numbers over time, with the names of the curves in their colours beside them, where they hide none."""
+    plot = _plot(specs, title, plot_legend=_HIDDEN, titlebar=not in_tab)
+    if plot is None:
+        return None
+    bounds = rrb.VisualBounds2D(x_range=(-3.0, 3.0), y_range=(-0.7, 4.7))
+    names = rrb.Spatial2DView(origin=f"{CURVES}/{panel.name}", titlebar=False, visual_bounds=bounds)
+    return rrb.Horizontal(plot, names, column_shares=[5, 2] if in_tab else [4, 1], name=title)
 
 
 def _below(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """Plots of stage times, queues, angles and own numbers; the ledger with the run's summary behind it."""
-    plots = _stage_plots(drawn, slowest)
-    for tabs in (_tabs(_plot(_at(drawn, panel), title) for panel, title in SENSOR_PLOTS), _tabs(_own_plots(drawn))):
-        if tabs is not None:
-            plots.append((tabs, 1.1))
+    sensors = (_panel(drawn, panel, title, in_tab=True) for panel, title in SENSOR_PLOTS)
+    plots = [_tabs(part for group in _stage_plots(drawn, slowest) for part in group), _tabs(sensors)]
     ledger, *texts = _texts(drawn)
     text = rrb.Tabs(ledger, _summary(), *texts, active_tab=0)
-    return rrb.Horizontal(*[part for part, _ in plots], text, column_shares=[*(share for _, share in plots), 2.0])
+    below = _row((plots[0], 2.0), (plots[1], 2.0), (_tabs(_own_plots(drawn)), 1.2), (text, 2.5))
+    return text if below is None else below
 
 
-def _stage_plots(drawn: Specs, slowest: Sequence[str]) -> list[tuple[_Part, float]]:
-    """The times of the stages and their queues, each with its share of the width."""
-    plots: list[tuple[_Part, float]] = []
+def _stage_plots(drawn: Specs, slowest: Sequence[str]) -> list[list[_Part]]:
+    """The times of the slowest stages and those of all stages; and their queues."""
+    plots: list[list[_Part]] = []
     named = [spec for spec in _at(drawn, Panel.STAGE) if spec.stream == SECONDS and spec.title in slowest]
     for root, title in ((SECONDS, "time of stages and sinks (s)"), (QUEUES, "queue depth (frames)")):
         lines = sum(spec.stream == root for spec in _at(drawn, Panel.STAGE))
@@ -314,8 +333,10 @@ def _stage_plots(drawn: Specs, slowest: Sequence[str]) -> list[tuple[_Part, floa
         if lines:
             name = title if few else f"{title}: hover for names"
             every = rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few))
-            first = _plot(named, "slowest stages and sinks (s)") if root == SECONDS and not few else None
-            plots.append((_tabs([first, every]) or every, 1.4))
+            first = None
+            if root == SECONDS and not few:
+                first = _named(named, "slowest stages and sinks (s)", Panel.STAGE, in_tab=True)
+            plots.append([every] if first is None else [first, every])
     return plots
 
 

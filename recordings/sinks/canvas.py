@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
+from textwrap import wrap
 from typing import Any
 
 import cv2
@@ -17,7 +18,7 @@ import pyarrow as pa
 import rerun as rr
 
 from recordings.sinks import colormaps
-from recordings.sinks.blueprint import LEDGER, Panel, ViewSpec
+from recordings.sinks.blueprint import CURVES, LEDGER, LEDGER_CHARS, Panel, ViewSpec
 from recordings.sinks.colormaps import Legend, Rgb
 from recordings.sinks.png import png
 from stages.data import Array, StereoCamera
@@ -98,13 +99,22 @@ class Canvas:
         if path not in drawn:
             self.recording.log(path, rr.SeriesLines(colors=[CURVE_RGB[len(drawn) % len(CURVE_RGB)]]), static=True)
             drawn.append(path)
+            self.name_curves(view.panel, [name.rpartition("/")[2].replace("\\", "") for name in drawn])
         self.log(path, rr.Scalars(float(value)), view)
+
+    def name_curves(self, panel: Panel, names: Sequence[str]) -> None:
+        """Log the names of the curves of a panel below each other, in the colours of `CURVE_RGB`."""
+        colors = [CURVE_RGB[number % len(CURVE_RGB)] for number in range(len(names))]
+        places = [(0.0, float(row)) for row in range(len(names))]
+        labels = rr.Points2D(places, colors=colors, radii=rr.Radius.ui_points(0.5), labels=names, show_labels=True)
+        self.recording.log(f"{CURVES}/{panel.name}", labels, static=True)
 
     def log_text(self, path: str, text: str, level: rr.TextLogLevel) -> None:
         """A line in the ledger, unless it is the last one of `path`."""
         if self._texts.get(path) != text:
             self._texts[path] = text
-            self.recording.log(f"{LEDGER}/{path}", rr.TextLog(text, level=level))
+            for line in lines_of(text):
+                self.recording.log(f"{LEDGER}/{path}", rr.TextLog(line, level=level))
 
     @property
     def small_width(self) -> int:
@@ -218,6 +228,11 @@ class Canvas:
             else:
                 self.recording.log(path, rr.Clear(recursive=False))
         self._before, self._now = self._now, {}
+
+
+def lines_of(text: str) -> list[str]:
+    """A text in lines that the ledger has room for."""
+    return wrap(text, LEDGER_CHARS, subsequent_indent="... ", break_long_words=False, break_on_hyphens=False)
 
 
 def label_counts(labels: Array) -> Array:

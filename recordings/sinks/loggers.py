@@ -41,7 +41,7 @@ DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them 
 ALL_CODES = np.arange(256, dtype=np.uint8)
 # Layer -> the upper end of its scale, twice the usual limit, and its unit
 LAYER_SCALES = {
-    "step": (0.4, "m"), "slope": (0.7, "rad"), "steepness": (0.7, "rad"), "roughness": (0.12, "m"),
+    "step": (0.4, "m"), "slope": (40.0, "deg"), "steepness": (40.0, "deg"), "roughness": (0.12, "m"),
     "variance": (0.009, "m²"),
 }  # fmt: skip
 DIFFERENCE_STEPS = 0.25  # the difference of the images is drawn to 4 gray levels
@@ -191,8 +191,8 @@ def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
 @logger_for(Tilt)
 def log_tilt(canvas: Canvas, stream: str, tilt: Tilt) -> None:
     """The angles of the inclinometer's axes above the horizon, in degrees."""
-    for name, sine in (("x axis up", tilt.up[0]), ("y axis up", tilt.up[1])):
-        _plot_angle(canvas, stream, name, sine)
+    for axis, sine in zip("xy", tilt.up, strict=False):
+        _plot_angle(canvas, stream, f"inclinometer {axis} up", sine)
 
 
 @logger_for(Pose)
@@ -250,11 +250,12 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     for name, layer in coarse.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
         view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
         picture = colormaps.birds_eye(layer)
-        values: Array = cv2.multiply(picture, 1.0, dtype=cv2.CV_16F)  # type: ignore[call-overload]
+        end, unit = LAYER_SCALES.get(name, (0.0, ""))
+        scale = float(np.degrees(1.0)) if unit == "deg" else 1.0
+        values: Array = cv2.multiply(picture, scale, dtype=cv2.CV_16F)  # type: ignore[call-overload]
         if name == "elevation":
             canvas.log_values(values, (low, high), view, "m", cv2.COLORMAP_VIRIDIS)
-        elif name in LAYER_SCALES:
-            end, unit = LAYER_SCALES[name]
+        elif unit:
             canvas.log_values(values, (0.0, end), view, unit)
         else:
             canvas.log_values(values, colormaps.value_limits(picture), view)

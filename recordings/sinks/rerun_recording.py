@@ -33,7 +33,7 @@ from recordings.sinks.blueprint import (
     Panel,
     ViewSpec,
 )  # fmt: skip
-from recordings.sinks.canvas import CURVE_RGB, Canvas
+from recordings.sinks.canvas import CURVE_RGB, Canvas, lines_of
 from recordings.sinks.follower import Follower
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from recordings.sinks.rerun_sink import RerunSink
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
+MAX_CELL = 60  # characters in a table of the run
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
 BATCH_BYTES = 4 << 20  # of some frames; each stored chunk takes 3 kB besides its content
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
@@ -165,7 +166,8 @@ class RerunRecording:
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
         for stream, finding in found:
             level = LEVELS.get(finding["severity"], rr.TextLogLevel.INFO)
-            self._recording.log(LEDGER, rr.TextLog(f"{stream}: {finding['sentence']}", level=level))
+            for line in lines_of(f"{stream}: {finding['sentence']}"):
+                self._recording.log(LEDGER, rr.TextLog(line, level=level))
         facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
         facts.pop("bottleneck", None)
         for key in {"surveys", "findings"} & facts.keys():
@@ -177,11 +179,7 @@ class RerunRecording:
             pictures["not drawn"] = ", ".join(self._settings.without)
         slowest = _slowest(summary.get("bottleneck", {}))
         self._recording.log(SUMMARY, _document(verdict, slowest, self._about, facts, pictures), static=True)
-        layout = self._layout()
-        for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
-            path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
-            self._recording.log(path, rr.SeriesLines(colors=[color]), static=True)
-        self._recording.log(LAYOUT, rr.TextDocument(layout.as_json()), static=True)
+        self._recording.log(LAYOUT, rr.TextDocument(self._layout().as_json()), static=True)
         self._views = -1  # the slowest stages are known now
         self._send_blueprint()
 
@@ -260,9 +258,14 @@ class RerunRecording:
         losses = sorted(entries, key=lambda entry: entry.stamp)
         if not losses:
             return
-        texts = [f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}" for entry in losses]
-        clocks = _clocks([entry.stamp for entry in losses], [frame] * len(losses))
-        columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(losses))
+        rows = [
+            (entry.stamp, line)
+            for entry in losses
+            for line in lines_of(f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}")
+        ]
+        stamps, texts = zip(*rows, strict=True)
+        clocks = _clocks(stamps, [frame] * len(rows))
+        columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(rows))
         self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
         self._stamp = max(losses[-1].stamp, self._stamp)
 
@@ -270,7 +273,12 @@ class RerunRecording:
         """Send the blueprint again if the frame added a view."""
         if len(self._canvas.views) != self._views:
             self._views = len(self._canvas.views)
-            self._recording.send_blueprint(self._layout().blueprint(self._settings.desk))
+            layout = self._layout()
+            for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
+                path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
+                self._recording.log(path, rr.SeriesLines(colors=[color]), static=True)
+            self._canvas.name_curves(Panel.STAGE, layout.slowest)
+            self._recording.send_blueprint(layout.blueprint(self._settings.desk))
 
     def _layout(self) -> Layout:
         slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
@@ -343,12 +351,15 @@ def _slowest(bottleneck: Mapping[str, Any]) -> dict[str, str]:
 
 def _document(verdict: str, *tables: Mapping[str, Any]) -> rr.TextDocument:
     """The verdict and the facts of the run, as markdown."""
-    values = [(key, value) for table in tables for key, value in table.items() if value not in ({}, "")]
-    rows = [
-        f"| {key} | {', '.join(f'{k} {v}' for k, v in value.items()) if isinstance(value, Mapping) else value} |"
-        for key, value in values
-        if "\n" not in str(value)
-    ]
-    texts = [f"## {key}\n```\n{value}\n```" for key, value in values if "\n" in str(value)]
-    text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows, "", *texts])
+    values = {
+        key: ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, Mapping) else str(value)
+        for table in tables
+        for key, value in table.items()
+        if value not in ({}, "")
+    }
+    rows = [f"| {key} | {value} |" for key, value in values.items() if "\n" not in value and len(value) <= MAX_CELL]
+    # The viewer wraps paragraphs, but no cells of a table.
+    long = [f"**{key}**: {value}\n" for key, value in values.items() if "\n" not in value and len(value) > MAX_CELL]
+    texts = [f"## {key}\n```\n{value}\n```" for key, value in values.items() if "\n" in value]
+    text = "\n".join([f"# {verdict}", "", "| | |", "|---|---|", *rows, "", *long, *texts])
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

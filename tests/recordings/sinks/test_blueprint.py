@@ -8,7 +8,7 @@ from recordings.errors import LogError
 from recordings.sinks import DESKS as NAMES
 from recordings.sinks.blueprint import DESKS, Layout, Panel, ViewSpec, read_layout
 from tests.conftest import roverflow
-from tests.recordings.sinks.recorded_scene import entities
+from tests.recordings.sinks.recorded_scene import entities, rows
 
 
 def views(part: Any) -> list[Any]:
@@ -50,6 +50,22 @@ def test_a_plot_of_many_lines_has_no_legend():
         shown = [plot.properties["PlotLegend"].visible.as_arrow_array().to_pylist() for plot in plots]
         assert shown == [[stages == 2]] * 2
         assert [plot.name.endswith("hover for names") for plot in plots] == [stages == 25] * 2
+
+
+def test_the_names_of_curves_stand_beside_a_plot_and_hide_none(rrd):
+    layout = read_layout(rrd)
+    for desk in ("overview", "tilt"):
+        shown = views(layout.blueprint(desk).root_container)
+        beside = {view.origin for view in shown if str(view.origin).startswith("curves/")}
+        assert {"curves/ANGLE", "curves/HEALTH"} <= beside
+        plots = [view for view in shown if view.name in ("tilt (degrees)", "tilt check (degrees)")]
+        legends = [view.properties["PlotLegend"].visible.as_arrow_array().to_pylist() for view in plots]
+        assert legends == [[False], [False]]
+    assert rows(rrd, "/curves/ANGLE", "Points2D:labels")[-1][2] == [
+        "inclinometer x up", "inclinometer y up", "camera pitch down", "camera roll right"
+    ]  # fmt: skip
+    colors = [rows(rrd, f"/tilt/inclinometer\\ {axis}\\ up", "SeriesLines:colors")[-1][2][0] for axis in "xy"]
+    assert rows(rrd, "/curves/ANGLE", "Points2D:colors")[-1][2][:2] == colors
 
 
 def test_the_command_line_names_the_desks_in_their_order():

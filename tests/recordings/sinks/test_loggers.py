@@ -183,13 +183,13 @@ def test_scalars_are_those_of_the_frame(rrd):
     assert [value for *_, value in rows(rrd, "/queues/matched", "Scalars:scalars")] == [[3.0]] * 3
     steps = rows(rrd, "/queues/matched", "SeriesLines:interpolation_mode")
     assert [value for *_, value in steps] == [[rr.components.InterpolationMode.StepAfter.value]]  # for all frames
-    tilt = rows(rrd, "/tilt/x\\ axis\\ up", "Scalars:scalars")[0][2]
+    tilt = rows(rrd, "/tilt/" + rr.escape_entity_path_part("inclinometer x up"), "Scalars:scalars")[0][2]
     assert tilt == [pytest.approx(np.degrees(0.1))]
 
 
 def test_curves_of_one_plot_differ_in_colour(rrd):
     names = [
-        *("/tilt/" + axis for axis in ("x axis up", "y axis up")),
+        *(f"/tilt/inclinometer {axis} up" for axis in "xy"),
         *("/points/camera " + way for way in ("pitch down", "roll right")),
     ]
     escaped = ["/".join(map(rr.escape_entity_path_part, name.split("/"))) for name in names]

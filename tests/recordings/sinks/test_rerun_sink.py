@@ -44,7 +44,7 @@ def test_every_intermediate_is_recorded(rrd):
         "/disparity/source/labels", "/disparity/superpixels", "/points/points", "/elevation_map/relief",
         "/elevation_map/layers/slope", "/elevation_map/surface", "/navigation_map/cells/labels",
         "/navigation_map/reason/labels", "/navigation_map/hazards", "/rectified/camera", "/pose/trajectory",
-        "/seconds/matched", "/queues/disparity", "/tilt/x\\ axis\\ up", "/ledger", "/summary",
+        "/seconds/matched", "/queues/disparity", "/tilt/inclinometer\\ x\\ up", "/ledger", "/summary",
     }  # fmt: skip
 
 
@@ -117,6 +117,19 @@ def test_a_sink_that_is_opened_again_starts_a_new_recording(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["second.rrd"]
     drawn = {entity for entity in entities(tmp_path / "second.rrd") if entity.startswith("/seconds/")}
     assert drawn == {"/seconds/second"}
+
+
+def test_a_long_line_of_the_ledger_is_continued_in_the_next_one(tmp_path):
+    why = "the frame lies 0.00 m and 6.6 degrees off the map, unlike the frames before it; it is left out of the map"
+    lost, sentence = Loss("map", START, "fuse", "failed", why), "the sign of pitch is flipped " * 9
+    summary = {"verdict": "COMPLETE", "findings": {"health": {"severity": "fault", "sentence": sentence}}}
+    path = record_of(tmp_path / "ledger.rrd", [Record(START, scene(), (lost,))], summary)
+    found = [(clock, value[0]) for clock, _, value in rows(path, "/ledger", "TextLog:text")]
+    assert max(len(line) for _, line in found) <= 80
+    assert {clock for clock, line in found if "fuse lost" in line or "out of the map" in line} == {START}
+    whole = " ".join(line.removeprefix("... ") for _, line in found)
+    assert f"fuse lost map: failed. {why}" in whole
+    assert f"health: {sentence.strip()}" in whole
 
 
 def test_losses_are_logged_at_their_own_stamps(tmp_path):

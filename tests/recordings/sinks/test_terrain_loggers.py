@@ -39,6 +39,19 @@ def test_layers_with_a_limit_and_heights_have_scales_that_stay(tmp_path):
     assert scales["relief"] == scales["layers/elevation"] == heights
 
 
+def test_slopes_are_drawn_in_degrees_as_their_limits_are_given(tmp_path):
+    terrain = scene()["elevation_map"]
+    layers = {"elevation": terrain.layers["elevation"], "slope": np.full(terrain.shape, np.radians(20.0), np.float32)}
+    path = record_of(tmp_path / "a.rrd", [Record(START, {"elevation_map": replace(terrain, layers=layers)})])
+    assert rows(path, "/elevation_map/layers/slope/scale/text", "Points2D:labels")[0][2] == [
+        "0 deg",
+        "20 deg",
+        "40 deg",
+    ]
+    buffer = np.array(rows(path, "/elevation_map/layers/slope", "DepthImage:buffer")[0][2][0], np.uint8)
+    np.testing.assert_allclose(buffer.view(np.float16), 20.0, atol=0.02)
+
+
 def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path):
     voxels = VoxelMap(
         START, np.array([[0, 0, 0], [20, -3, 2]], np.int32), np.array([[1, 2, 3], [4, 5, 6]], np.uint8),
