@@ -4,6 +4,9 @@ Fleets of one process, two processes, and one process with a third of the logs a
 each. A fleet's time is that of starting, of its runs, and of an overhead for each log. So two fleets of one process
 with different numbers of logs give the overhead and the time of starting. Two commands `roverflow run` at once, over
 the same two one after the other, show what the machine itself gains by a second process.
+
+With --tiny, a scheduler, two workers and a client, each a process of its own, run that many logs of one and two frames
+instead; the table has the memory of each process and the CPU of scheduler and client, as logs end.
 """
 
 from __future__ import annotations
@@ -16,10 +19,14 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+from distributed import Client
+
 from flow.cli.fleet.catalogue import Catalogue
 from recordings.simulator import Simulation, write_log
 
 LOGS, FEW = 12, 4
+DIFFERENT, PORT = 20, 18790  # tiny logs that differ; of the scheduler
 SETTINGS = ("-p", "rover", "--set", "disparities=96", "--workers-per-log", "1")
 
 
@@ -36,7 +43,12 @@ def main(arguments: list[str] | None = None) -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser("python -m tests.bench.fleet", description=__doc__)
     parser.add_argument("--rounds", type=int, default=2, help="fleets of each kind (2)")
-    rounds = parser.parse_args(arguments).rounds
+    parser.add_argument("--tiny", type=int, metavar="LOGS", help="memory of the processes with that many tiny logs")
+    options = parser.parse_args(arguments)
+    if options.tiny:
+        _tiny(options.tiny)
+        return
+    rounds = options.rounds
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder) / "logs"
         logs.mkdir()
@@ -96,6 +108,51 @@ def _fleet(logs: list[Path], out: Path, processes: int) -> Fleet:
     subprocess.run([sys.executable, "-m", "flow", *words], check=True, stdout=subprocess.DEVNULL)
     seconds, rows = time.perf_counter() - begun, Catalogue(out).rows()
     return Fleet(seconds, sum(row["seconds"] for row in rows), sum(row["stage_seconds"] for row in rows))
+
+
+def _tiny(logs: int) -> None:
+    """Print the memory of all processes after a tenth, half and all of the logs."""
+    with tempfile.TemporaryDirectory() as name:
+        folder, address = Path(name), f"tcp://127.0.0.1:{PORT}"
+        (folder / "logs").mkdir()
+        for number in range(min(DIFFERENT, logs)):
+            simulation = Simulation(frames=1 + number % 2, width=64, height=64, seed=number, relief_cells=512)
+            write_log(simulation, folder / f"log{number}.mcap")
+        for number in range(logs):
+            (folder / "logs" / f"log{number:05d}.mcap").symlink_to(folder / f"log{number % DIFFERENT}.mcap")
+        scheduler = ("scheduler", "--host", "127.0.0.1", "--port", str(PORT), "--no-dashboard")
+        worker = ("worker", address, "--nthreads", "1", "--host", "127.0.0.1", "--no-dashboard", "--no-nanny")
+        dask = [
+            subprocess.Popen([sys.executable, "-m", f"distributed.cli.dask_{kind}", *words], stderr=subprocess.DEVNULL)
+            for kind, *words in (scheduler, worker, worker)
+        ]
+        try:
+            with Client(address, timeout=60) as client:
+                client.wait_for_workers(2, timeout=60)
+            _watch_memory(folder, logs, address, dask)
+        finally:
+            for process in reversed(dask):
+                process.terminate()
+                process.wait()
+
+
+def _watch_memory(folder: Path, logs: int, address: str, dask: list[subprocess.Popen[bytes]]) -> None:
+    words = ["fleet", str(folder / "logs"), "--out", str(folder / "out"), "-p", "fast", "--set", "disparities=16"]
+    command = [sys.executable, "-m", "flow", *words, "--workers-per-log", "1", "--cluster", address]
+    print(f"\n{logs} logs of 1 and 2 frames, 64x64, fast, one thread a log; client, scheduler, two workers")
+    print(f"{'logs':>8} {'memory, MB':>24} {'CPU of client and scheduler, s':>32}")
+    begun = time.perf_counter()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as fleet:
+        watched = [psutil.Process(process) for process in (fleet.pid, *(process.pid for process in dask))]
+        assert fleet.stdout is not None
+        for line in fleet.stdout:
+            ended = line.partition(" of ")[0]
+            if ended in {str(logs // 10), str(logs // 2), str(logs)}:
+                memory = " ".join(f"{process.memory_info().rss / 1e6:.0f}" for process in watched)
+                cpu = " ".join(f"{sum(process.cpu_times()[:2]):.1f}" for process in watched[:2])
+                print(f"{ended:>8} {memory:>24} {cpu:>32}")
+    rows = Catalogue(folder / "out").rows("state = 'done' AND verdict = 'COMPLETE'")
+    print(f"{time.perf_counter() - begun:.0f} s; {len(rows)} of {logs} logs in the catalogue are COMPLETE")
 
 
 if __name__ == "__main__":

@@ -73,6 +73,10 @@ def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
     assert task.result.stat().st_mtime_ns == written
     assert reason_to_run(job, {**row, "result": row["result"]}, pipeline.digest, row["version"], tmp_path / "out") == ""
     assert reason_to_run(job, row, "other", row["version"], tmp_path / "out") == "the pipeline changed"
+    same = (pipeline.digest, row["version"], tmp_path / "out", True)
+    assert reason_to_run(job, row, *same) == "its recording is missing"
+    assert run_task(replace(task, recording=True))["result"] == "a-nav.mcap"
+    assert reason_to_run(job, row, *same) == ""
     broken = run_task(replace(task, log=logs / "junk.mcap", result=tmp_path / "out" / "junk-nav.mcap"))
     assert (broken["state"], "is not an MCAP log" in broken["why"]) == ("unusable", True)
     absent = run_task(replace(task, log=logs / "nix.mcap", result=tmp_path / "out" / "nix-nav.mcap"))
@@ -147,6 +151,12 @@ def test_a_second_fleet_in_the_folder_is_refused(logs, tmp_path, capsys):
         assert roverflow("fleet", logs / "a.mcap", "--out", tmp_path, *PIPELINE) == 2
     assert f"another roverflow fleet runs in {tmp_path}; --watch shows it" in capsys.readouterr().err
     assert Catalogue(tmp_path).is_held() is False
+
+
+def test_an_empty_log_that_ends_first_leaves_all_time(capsys):
+    with Progress({"empty": 0, "log": 9}) as progress:
+        progress.end("empty", {"state": "unusable", "why": "it is empty"})
+    assert capsys.readouterr().out.startswith("1 of 2: empty: unusable: it is empty; 0 frames so far, 0.00 GB left")
 
 
 def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, capsys):

@@ -72,7 +72,8 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
 
     folder = catalogue.path.parent
     rows = {row["name"]: row for row in catalogue.rows()}
-    why = {job: reason_to_run(job, rows.get(job.name), pipeline.digest, product_version(), folder) for job in jobs}
+    same = (pipeline.digest, product_version(), folder, options.rrd)
+    why = {job: reason_to_run(job, rows.get(job.name), *same) for job in jobs}
     due = [job for job, reason in why.items() if reason]
     reasons = {reason: sum(other == reason for other in why.values()) for reason in why.values() if reason}
     size, listed = sum(job.size for job in due) / 1e9, ", ".join(f"{n} {reason}" for reason, n in reasons.items())

@@ -201,7 +201,7 @@ def cluster(address: str | None, processes: int, memory: str, dashboard: bool) -
     if address is not None:
         try:
             client = Client(address, timeout=20)
-        except (OSError, TimeoutError, ValueError) as error:
+        except (OSError, TimeoutError, ValueError, TypeError) as error:  # a type: no certificates for TLS
             raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
         with client:
             yield client

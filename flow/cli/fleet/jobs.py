@@ -56,8 +56,13 @@ def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, An
     return sorted(jobs, key=lambda job: (-job.size, job.name))
 
 
-def reason_to_run(job: Job, row: Mapping[str, Any] | None, pipeline_digest: str, version: str, folder: Path) -> str:
-    """Why a job has to run; empty if its row has the result of the same log, pipeline and version."""
+def reason_to_run(
+    job: Job, row: Mapping[str, Any] | None, pipeline_digest: str, version: str, folder: Path, recording: bool = False
+) -> str:
+    """Why a job has to run; empty if its row has the result of the same log, pipeline and version.
+
+    recording: whether a recording has to be beside the result.
+    """
     if row is None or not row["state"]:
         return "new"
     if row["log_digest"] != job.digest:
@@ -70,6 +75,8 @@ def reason_to_run(job: Job, row: Mapping[str, Any] | None, pipeline_digest: str,
         return "it failed" if row["state"] == "failed" else "it was not finished"
     if row["state"] == "done" and row["result"] and not (folder / row["result"]).is_file():
         return "its result is missing"
+    if recording and row["result"] and not (folder / row["result"]).with_suffix(".rrd").is_file():
+        return "its recording is missing"
     return ""
 
 

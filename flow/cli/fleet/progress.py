@@ -34,7 +34,7 @@ class Progress(AbstractContextManager["Progress"]):
 
         self._left, self._ended, self._all = dict(left), logs, logs + len(left)
         self._frames, self._frames_before, self._size = frames, frames, sum(left.values())
-        self._running: Mapping[str, int] = {}
+        self._running = dict[str, int]()
         self._begun = time.monotonic()
         hidden = not sys.stderr.isatty()
         self._bar = tqdm(total=self._size, unit="B", unit_scale=True, smoothing=0, disable=hidden)
@@ -49,20 +49,22 @@ class Progress(AbstractContextManager["Progress"]):
 
     def show(self, running: Mapping[str, int]) -> None:
         """Move the bar; running: name -> frames so far of each log that runs."""
-        self._running = running
+        self._running = dict(running)
         self._bar.n = round(self._size - self._bytes_left())
-        frames = self._frames + sum(running.values())
-        self._bar.set_postfix_str(f"{self._ended} of {counted(self._all, 'log')}, {counted(frames, 'frame')}")
+        frames = counted(self._frames + sum(running.values()), "frame")
+        self._bar.set_postfix_str(f"{self._ended} of {counted(self._all, 'log')}, {frames}")
 
     def end(self, name: str, row: Mapping[str, Any]) -> None:
         """Print the line of a log that has ended."""
         self._left.pop(name, None)
+        self._running.pop(name, None)
         self._ended += 1
         self._frames += row.get("frames") or 0
         line = f"{self._ended} of {self._all}: {name}: {line_of(row)}"
         if left := self._bytes_left():
-            seconds = (time.monotonic() - self._begun) * left / (self._size - left)
-            line += f"; {self._frames} frames so far, {left / 1e9:.2f} GB left, about {duration(seconds)}"
+            seconds = (time.monotonic() - self._begun) * left / max(self._size - left, 1)
+            frames = self._frames + sum(self._running.values())
+            line += f"; {frames} frames so far, {left / 1e9:.2f} GB left, about {duration(seconds)}"
         self.say(line)
 
     def _bytes_left(self) -> float:

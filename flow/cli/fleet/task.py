@@ -132,7 +132,7 @@ def run_task(task: Task) -> dict[str, Any]:
         with suppress(OSError):
             task.progress.unlink()
     row = task.identity() | node | _columns(summary)
-    partial = task.note.with_suffix(f".{os.getpid()}.partial")
+    partial = task.result.with_name(f"{task.result.name}.{os.getpid()}-note.partial")
     partial.write_text(json.dumps({"row": row, "summary": summary}, indent=2))
     partial.replace(task.note)
     return row
@@ -178,7 +178,9 @@ def _finished(task: Task) -> dict[str, Any] | None:
     except (OSError, ValueError, KeyError, TypeError):
         return None
     same = all(row.get(name) == value for name, value in task.identity().items())
-    return row if same and row["state"] == "done" and (row["result"] is None or task.result.is_file()) else None
+    files = [task.result, *([task.result.with_suffix(".rrd")] if task.recording else [])]
+    there = row["result"] is None or all(file.is_file() for file in files)
+    return row if same and row["state"] == "done" and there else None
 
 
 def about_worker(task: Task) -> dict[str, str]:
