@@ -1,5 +1,6 @@
 """Compiled kernels are kept between runs, announced when compiled, and compiled again after any source has changed."""
 
+import ast
 import os
 import re
 import shutil
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[3]
+JITS = {"kernel", "part", "fast_kernel", "fast_part", "typed_kernel", "borrowing_kernel", "njit"}
 SCRIPT = """
 import numpy as np
 from stages.kernel_loading import imported_kernels, load
@@ -97,3 +99,34 @@ def test_a_change_in_the_simulator_keeps_the_kernels_of_the_stages(run, tmp_path
     again = run(DIGESTS)[0].split()
     assert again[:2] == [matching, terrain]
     assert again[2] != simulator
+
+
+def decorators(function):
+    return {node.id for made in function.decorator_list for node in ast.walk(made) if isinstance(node, ast.Name)}
+
+
+def functions(tree):
+    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+
+
+def test_python_calls_no_function_that_only_kernels_can_call():
+    """Such a call ends the process: `part` makes no wrapper for Python."""
+    trees = {
+        ".".join(file.relative_to(ROOT).with_suffix("").parts): ast.parse(file.read_text())
+        for room in ("flow", "stages", "recordings", "tests")
+        for file in (ROOT / room).rglob("*.py")
+    }
+    parts = {
+        module: {each.name for each in functions(tree) if decorators(each) & {"part", "fast_part"}}
+        for module, tree in trees.items()
+    }
+    assert "root" in parts["stages.compiled.union_find"]
+    for module, tree in trees.items():
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module in parts]
+        known = parts[module] | {name.name for node in imports for name in node.names} & set.union(
+            set(), *(parts[node.module] for node in imports)
+        )
+        compiled = [each for each in functions(tree) if decorators(each) & JITS]
+        inside = {id(node) for each in compiled for node in ast.walk(each)}
+        called = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call) and id(node) not in inside]
+        assert not known & {name.id for name in called if isinstance(name, ast.Name)}, module
