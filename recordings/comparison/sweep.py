@@ -11,7 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recordings.comparison.diff import Diff
-from recordings.export.page_layout import INK, PAPER
+from recordings.export.page_layout import INK, PAPER, round_step
 from recordings.sinks.png import png
 from stages.data import Array
 
@@ -52,7 +52,7 @@ def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Arra
     """A bar for each value of a setting and a line for A, as an RGB picture; figures: of A, B, C, ..."""
     page = np.full((HEIGHT, WIDTH, 3), PAPER, np.uint8)
     known = np.nan_to_num(np.array(figures, float))
-    step = _step(float(known.max()))
+    step = round_step(float(known.max()) / 2)
     top, bottom, wide = step * max(1, np.ceil(known.max() / step)), HEIGHT - BOTTOM, (WIDTH - LEFT - 70) / len(values)
 
     def row(figure: float) -> int:
@@ -71,12 +71,6 @@ def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Arra
     _text(page, "A", (WIDTH - 58, row(known[0]) + 12), 0.0)
     _text(page, setting, (LEFT + (WIDTH - LEFT - 70) // 2, HEIGHT - 14), 0.5)
     return page
-
-
-def _step(highest: float) -> float:
-    """A round step of an axis that reaches up to `highest` in two to five steps."""
-    power = 10.0 ** np.floor(np.log10(highest / 2))
-    return float(max(step for step in (power, 2 * power, 5 * power) if step <= highest / 2 * (1 + 1e-9)))
 
 
 def _width(text: str) -> int:

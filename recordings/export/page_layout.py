@@ -82,6 +82,12 @@ def _ticks(start: float, length: float) -> Array:
     return 2.0 * np.arange(np.ceil(start / 2.0), np.floor((start + length) / 2.0) + 1) + 0.0  # no minus zero
 
 
+def round_step(longest: float) -> float:
+    """The longest step of an axis with round ticks: 1, 2 or 5 times a power of ten, at most `longest`."""
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(step for step in (power, 2 * power, 5 * power) if step <= longest * (1 + 1e-9))
+
+
 def add_bar(
     page: Array, low: float, high: float, colors: Callable[[Array], Array],
     others: Mapping[int, tuple[str, colormaps.Rgb]] = MappingProxyType({}),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from html import escape
 
 import cv2
 import numpy as np
 
+from recordings.export.page_layout import round_step
 from stages.data import Array
 
 WIDTH, HEIGHT, MARGIN = 480, 180, 52
@@ -24,7 +26,8 @@ def line_plot(title: str, curves: Mapping[str, Sequence[tuple[float, float]]]) -
     times, values = (np.array(part) for part in zip(*points, strict=True))
     low, high = float(values.min()), float(values.max())
     margin = 0.05 * (high - low) or max(1.0, abs(high)) * 0.05
-    return _plot(title, curves, (float(times.min()), float(times.max())), (low - margin, high + margin), "s")
+    low = low - margin if low < 0 else max(0.0, low - margin)
+    return _plot(title, curves, (float(times.min()), float(times.max())), (low, high + margin), "s")
 
 
 def track_plot(title: str, tracks: Mapping[str, Sequence[tuple[float, float]]]) -> str:
@@ -64,12 +67,12 @@ def _plot(
         return f"{x:.1f},{y:.1f}"
 
     parts = [f'<text x="{MARGIN}" y="18" class="title">{escape(title)}</text>']
-    for share in (0.0, 0.5, 1.0):
-        value, y = along[0] + share * (along[1] - along[0]), HEIGHT - MARGIN - share * (HEIGHT - 2 * MARGIN)
+    for value in _ticks(*along):
+        y = float(place((across[0], value)).partition(",")[2])
         parts.append(f'<line x1="{MARGIN}" x2="{WIDTH - MARGIN}" y1="{y}" y2="{y}" class="grid"/>')
         parts.append(f'<text x="{MARGIN - 6}" y="{y + 4}" class="left">{_number(value)}</text>')
-        x = MARGIN + share * (WIDTH - 2 * MARGIN)
-        label = f"{_number(across[0] + share * span)} {unit}"
+    for value in _ticks(*across):
+        x, label = place((value, along[0])).partition(",")[0], f"{_number(value)} {unit}"
         parts.append(f'<text x="{x}" y="{HEIGHT - MARGIN + 18}" class="middle">{label}</text>')
     for number, (name, curve) in enumerate(curves.items()):
         color = COLORS[number % len(COLORS)]
@@ -84,5 +87,11 @@ def _plot(
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img">{"".join(parts)}</svg>'
 
 
+def _ticks(low: float, high: float) -> list[float]:
+    """Two to five round numbers from `low` to `high`."""
+    step = round_step((high - low) / 2 or 1.0)
+    return [number * step for number in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)]
+
+
 def _number(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
