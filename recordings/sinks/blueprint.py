@@ -308,7 +308,7 @@ def _named(specs: Iterable[ViewSpec], title: str, panel: Panel, in_tab: bool) ->
     plot = _plot(specs, title, plot_legend=_HIDDEN, titlebar=not in_tab)
     if plot is None:
         return None
-    bounds = rrb.VisualBounds2D(x_range=(-3.0, 3.0), y_range=(-0.7, 4.7))
+    bounds = rrb.VisualBounds2D(x_range=(-1.5, 1.5), y_range=(-0.7, 4.7))
     names = rrb.Spatial2DView(origin=f"{CURVES}/{panel.name}", titlebar=False, visual_bounds=bounds)
     return rrb.Horizontal(plot, names, column_shares=[5, 2] if in_tab else [4, 1], name=title)
 
