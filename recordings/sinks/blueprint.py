@@ -26,6 +26,7 @@ FRAME = "frame"  # the timeline that counts frames
 LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "seconds", "queues"
 LAYOUT = "layout"  # the text from which other desks are made
 CURVES = "curves"  # the names of the curves of a panel, which stand beside the plot
+SLOWEST = f"{LAYOUT}/slowest"  # those of the slowest stages, which differ from run to run
 LEDGER_CHARS = 80  # of a line of the ledger, which the viewer does not wrap
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
 SHOWN_LAYERS = (
@@ -300,16 +301,18 @@ def _plot(specs: Iterable[ViewSpec], title: str, **options: Any) -> rrb.View | N
 def _panel(drawn: Specs, panel: Panel, title: str, in_tab: bool) -> _Part | None:
     """The numbers of a panel over time."""
     specs = _at(drawn, panel)
-    return _plot(specs, title, plot_legend=_HIDDEN) if panel is Panel.FEATURES else _named(specs, title, panel, in_tab)
+    if panel is Panel.FEATURES:  # a single curve
+        return _plot(specs, title, plot_legend=_HIDDEN)
+    return _named(specs, title, f"{CURVES}/{panel.name}", in_tab)
 
 
-def _named(specs: Iterable[ViewSpec], title: str, panel: Panel, in_tab: bool) -> _Part | None:
+def _named(specs: Iterable[ViewSpec], title: str, names_at: str, in_tab: bool) -> _Part | None:
     """Numbers over time, with the names of the curves in their colours beside them, where they hide none."""
     plot = _plot(specs, title, plot_legend=_HIDDEN, titlebar=not in_tab)
     if plot is None:
         return None
     bounds = rrb.VisualBounds2D(x_range=(-1.5, 1.5), y_range=(-0.7, 4.7))
-    names = rrb.Spatial2DView(origin=f"{CURVES}/{panel.name}", titlebar=False, visual_bounds=bounds)
+    names = rrb.Spatial2DView(origin=names_at, titlebar=False, visual_bounds=bounds)
     return rrb.Horizontal(plot, names, column_shares=[5, 2] if in_tab else [4, 1], name=title)
 
 
@@ -335,7 +338,7 @@ def _stage_plots(drawn: Specs, slowest: Sequence[str]) -> list[list[_Part]]:
             every = rrb.TimeSeriesView(origin=root, name=name, plot_legend=rrb.PlotLegend("LeftTop", visible=few))
             first = None
             if root == SECONDS and not few:
-                first = _named(named, "slowest stages and sinks (s)", Panel.STAGE, in_tab=True)
+                first = _named(named, "slowest stages and sinks (s)", SLOWEST, in_tab=True)
             plots.append([every] if first is None else [first, every])
     return plots
 

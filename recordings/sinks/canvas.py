@@ -99,15 +99,17 @@ class Canvas:
         if path not in drawn:
             self.recording.log(path, rr.SeriesLines(colors=[CURVE_RGB[len(drawn) % len(CURVE_RGB)]]), static=True)
             drawn.append(path)
-            self.name_curves(view.panel, [name.rpartition("/")[2].replace("\\", "") for name in drawn])
+            self.name_curves(
+                f"{CURVES}/{view.panel.name}", [name.rpartition("/")[2].replace("\\", "") for name in drawn]
+            )
         self.log(path, rr.Scalars(float(value)), view)
 
-    def name_curves(self, panel: Panel, names: Sequence[str]) -> None:
-        """Log the names of the curves of a panel below each other, in the colours of `CURVE_RGB`."""
+    def name_curves(self, path: str, names: Sequence[str]) -> None:
+        """Log the names of curves below each other, in the colours of `CURVE_RGB`."""
         colors = [CURVE_RGB[number % len(CURVE_RGB)] for number in range(len(names))]
         places = [(0.0, float(row)) for row in range(len(names))]
         labels = rr.Points2D(places, colors=colors, radii=rr.Radius.ui_points(0.5), labels=names, show_labels=True)
-        self.recording.log(f"{CURVES}/{panel.name}", labels, static=True)
+        self.recording.log(path, labels, static=True)
 
     def log_text(self, path: str, text: str, level: rr.TextLogLevel) -> None:
         """A line in the ledger, unless it is the last one of `path`."""

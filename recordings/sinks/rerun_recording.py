@@ -28,6 +28,7 @@ from recordings.sinks.blueprint import (
     MAX_LEGEND_LINES,
     QUEUES,
     SECONDS,
+    SLOWEST,
     SUMMARY,
     Layout,
     Panel,
@@ -277,7 +278,7 @@ class RerunRecording:
             for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
                 path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
                 self._recording.log(path, rr.SeriesLines(colors=[color]), static=True)
-            self._canvas.name_curves(Panel.STAGE, layout.slowest)
+            self._canvas.name_curves(SLOWEST, layout.slowest)
             self._recording.send_blueprint(layout.blueprint(self._settings.desk))
 
     def _layout(self) -> Layout:
