@@ -13,7 +13,7 @@ from flow.cli import watching
 from recordings import RerunSink
 from tests.conftest import SMALL, roverflow
 from tests.recordings.sinks.recorded_scene import START, STREAMS, Record, pictures, rows, scene
-from tests.viewers import answers, send, viewer, wait_for_bytes
+from tests.viewers import answers, send, viewer, wait_for, wait_for_bytes
 
 FRAME_BYTES = 100_000  # fewer than a frame of the traverse has in the recording
 
@@ -68,6 +68,7 @@ def test_a_viewer_that_stops_or_dies_changes_nothing(traverse, result, tmp_path,
 
         def interrupted(sink, record):
             if record.index == 0 and how == "--serve":
+                wait_for(lambda: answers(port_of(started[0])), "the server does not answer")  # a client does not wait
                 started.append(
                     stack.enter_context(viewer("--save", seen, f"rerun+http://127.0.0.1:{port_of(started[0])}/proxy"))
                 )

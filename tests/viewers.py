@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -38,10 +38,15 @@ def answers(port: int) -> bool:
         return tried.connect_ex(("127.0.0.1", port)) == 0
 
 
-def wait_for_bytes(path: Path, size: int) -> None:
-    """Wait until a file has at least `size` bytes."""
+def wait_for(true: Callable[[], bool], otherwise: str) -> None:
+    """Wait until something is true, for a minute at most."""
     for _ in range(600):
-        if path.exists() and path.stat().st_size >= size:
+        if true():
             return
         time.sleep(0.1)
-    raise TimeoutError(f"{path} has not {size} bytes")
+    raise TimeoutError(otherwise)
+
+
+def wait_for_bytes(path: Path, size: int) -> None:
+    """Wait until a file has at least `size` bytes."""
+    wait_for(lambda: path.exists() and path.stat().st_size >= size, f"{path} has not {size} bytes")
