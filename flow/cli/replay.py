@@ -53,7 +53,7 @@ def replay(
     logs = (log,) if isinstance(log, Path) else tuple(log)
     files = _files(graph, logs)
     inputs = tuple(map(str, logs)) if with_inputs else ()
-    given = {"live_pipe": live_pipe, "profile": profile, "desk": desk, "inputs": inputs}
+    given = {"live_pipe": live_pipe, "profile": profile, "desk": desk, "inputs": inputs, "limits": _limits(graph)}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
     stop = Stop()
@@ -107,6 +107,15 @@ def _files(graph: Graph, logs: Sequence[Path]) -> Sequence[Path]:
         if about := about_run(file):
             raise LogError(f"{file} contains results; run the log that they were made from, {about.get('log', '')}")
     return files
+
+
+def _limits(graph: Graph) -> tuple[str, ...]:
+    """The limits of the layers of elevation maps, as `RerunSink.limits` has them."""
+    from stages import Binarise
+    from stages.terrain.verdict_limits import limits_of
+
+    rules = [(node.inputs["elevation"], node.actor) for node in graph.nodes if isinstance(node.actor, Binarise)]
+    return tuple(f"{stream}/{name}={limit:g}" for stream, rule in rules for name, limit in limits_of(rule).items())
 
 
 def _with(sink: Any, given: Mapping[str, Any]) -> Any:

@@ -6,7 +6,7 @@ viewer never shows an old picture as this frame's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from textwrap import wrap
@@ -53,9 +53,11 @@ class Canvas:
     sized: frozenset[str] = frozenset()  # all streams of disparities and images
     matched: frozenset[str] = frozenset()  # the stream of the match that the last disparity is made from
     counts_bytes: bool = False
+    hazard_limits: Mapping[str, float] = field(default_factory=dict)  # stream/layer -> in the unit of its scale
     logged_bytes: int = 0  # so far, before compression
     views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
     camera: StereoCamera | None = None
+    ways: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # frame -> x and y of the poses so far
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _texts: dict[str, str] = field(default_factory=dict)
     _legends: dict[str, Legend] = field(default_factory=dict)
@@ -149,10 +151,11 @@ class Canvas:
         view: ViewSpec,
         unit: str | None = None,
         palette: int = cv2.COLORMAP_TURBO,
+        hazard: float | None = None,
     ) -> None:
         """Values (H, W) in colours over a range; hover reads them. Unknown ones have `UNKNOWN_RGB` or nearly black.
 
-        unit: of the scale above the picture; None: no scale.
+        unit: of the scale above the picture; None: no scale; hazard: the value from which cells are hazards.
         """
         low, high = limits
         ends = (low - 0.1 * (high - low), high)
@@ -163,7 +166,7 @@ class Canvas:
             mask = _raw(rr.SegmentationImage, np.isnan(values).view(np.uint8))
             self._log(f"{view.path}/unknown", rr.SegmentationImage, [*mask, *_opaque_where_unknown()])
         if unit is not None:
-            self.log_scale(f"{view.path}/scale", values.shape, low, high, unit, palette)
+            self.log_legend(f"{view.path}/scale", values.shape, _scale(low, high, unit, palette, hazard))
 
     def log_steps(
         self,
@@ -286,11 +289,14 @@ def _depth_range(ends: tuple[float, float]) -> rr.DescribedComponentBatch:
 
 
 @lru_cache(maxsize=256)
-def _scale(low: float, high: float, unit: str, palette: int) -> tuple[tuple[str, Rgb], ...]:
-    """Three values of a colour map, with their colours."""
-    values = np.linspace(low, high, 3)
+def _scale(
+    low: float, high: float, unit: str, palette: int, hazard: float | None = None
+) -> tuple[tuple[str, Rgb], ...]:
+    """Three values of a colour map, with their colours; the middle one is the limit of hazards, if there is one."""
+    values = np.array([low, (low + high) / 2 if hazard is None else hazard, high])
     colors = [(int(r), int(g), int(b)) for r, g, b in colormaps.apply_palette(values, low, high, palette)]
     names = [f"{colormaps.format_value(value)} {unit}".rstrip() for value in values]
+    names[1] = names[1] if hazard is None else f"limit {names[1]}"
     return tuple(zip(names, colors, strict=True))
 
 

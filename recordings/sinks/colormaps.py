@@ -7,9 +7,10 @@ colour that no value has. Colour ranges are rounded, so that neighbouring frames
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,9 +19,11 @@ from recordings.scoring.metrics import cell_centres
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin
 
 Rgb = tuple[int, int, int]
+Point = tuple[float, float]
 Legend = Mapping[int, tuple[str, Rgb]]  # code -> name, colour
 
 MIN_SAMPLES = 4096  # values that a colour range is found from, where there are so many
+LINE_SPACING = 2  # m, between the lines across a map
 METRES_BEHIND = 1.0  # m behind the rover that a picture shows if nothing is known farther behind
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
@@ -167,6 +170,31 @@ def segment_edges(labels: Array) -> Array:
 def birds_eye(grid: Array) -> Array:
     """A grid (rows along y, columns along x, ...) as a picture: x forward is up, y left is left."""
     return np.ascontiguousarray(grid.swapaxes(0, 1)[::-1, ::-1])
+
+
+def distance_lines(
+    shape: tuple[int, int], origin: tuple[float, float], resolution: float, rover: tuple[float, float] | None
+) -> tuple[list[Any], dict[str, Any]]:
+    """Lines across a bird's-eye view of a grid at every second metre of x, and named points: distances, rover."""
+    width = float(shape[0])
+    far, left = (start + count * resolution for start, count in zip(origin, shape[::-1], strict=True))
+    first, last = np.ceil(origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
+    ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
+    depths = (far - ahead) / resolution
+    marks, names = [(width, depth) for depth in depths], [f"{x:.0f} m" for x in ahead]
+    if rover is not None:
+        marks, names = [*marks, ((left - rover[1]) / resolution, (far - rover[0]) / resolution)], [*names, "rover"]
+    return [[(0.0, depth), (width, depth)] for depth in depths], {"positions": marks, "labels": names}
+
+
+def way_on(grid: ElevationMap | NavigationMap, shape: tuple[int, int], way: Sequence[Point]) -> list[list[Point]]:
+    """The parts of a way, (x, y) in m, that lie on a grid of (rows, columns), in pixels of its bird's-eye view."""
+    size = np.array(shape[::-1])
+    cells = (np.array(way).reshape(-1, 2) - grid.origin) / grid.resolution
+    inside = np.all((cells >= 0) & (cells <= size), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int))).reshape(-1, 2)
+    pixels = (size - cells)[:, ::-1]
+    return [pixels[first:end].tolist() for first, end in edges if end > first + 1]
 
 
 def terrain_ahead(terrain: ElevationMap) -> ElevationMap:

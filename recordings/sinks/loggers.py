@@ -50,7 +50,6 @@ MAX_SIGMA = 0.5  # px, the upper end of the scale of the disparities' standard d
 MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
 MIN_DEPTH = 0.2  # m in front of the camera, of what is drawn over its image
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
-LINE_SPACING = 2  # m, between the lines across a map
 CAMERA_RGB: Rgb = (255, 210, 60)
 THUMBNAIL_SCALE = 0.25  # of the image in the camera's frustum
 
@@ -202,6 +201,7 @@ def log_pose(canvas: Canvas, stream: str, pose: Pose) -> None:
     arrow = rr.Arrows3D(origins=[pose.position], vectors=[forward], colors=[CAMERA_RGB])
     view = ViewSpec(Panel.TRAJECTORY, stream, "trajectory", f"{stream} ({pose.frame_id})", pose.frame_id)
     canvas.log(view.path, arrow, view)
+    canvas.ways.setdefault(pose.frame_id, []).append((float(pose.position[0]), float(pose.position[1])))
 
 
 @logger_for(CameraMotion)
@@ -256,7 +256,7 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
         if name == "elevation":
             canvas.log_values(values, (low, high), view, "m", cv2.COLORMAP_VIRIDIS)
         elif unit:
-            canvas.log_values(values, (0.0, end), view, unit)
+            canvas.log_values(values, (0.0, end), view, unit, hazard=canvas.hazard_limits.get(f"{stream}/{name}"))
         else:
             canvas.log_values(values, colormaps.value_limits(picture), view)
     vertices, triangles = colormaps.surface(coarse)
@@ -369,29 +369,22 @@ def _frame_suffix(frame_id: str) -> str:
 
 
 def _log_distances(canvas: Canvas, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
-    """Lines across a bird's-eye view at every second metre of x, with their distances, and the rover's place."""
+    """Lines across a bird's-eye view at every second metre of x, with their distances; the rover's place and way."""
     content, thin = (shape, grid.origin, grid.resolution, _rover_place(grid)), rr.Radius.ui_points(0.6)
     lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
     points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
-    canvas.keep(path, content, lambda: rr.LineStrips2D(_distances(*content)[0], **lines))
+    canvas.keep(path, content, lambda: rr.LineStrips2D(colormaps.distance_lines(*content)[0], **lines))
     canvas.keep(
-        f"{path}/distances", content, lambda: rr.Points2D(**_distances(*content)[1], show_labels=True, **points)
+        f"{path}/distances",
+        content,
+        lambda: rr.Points2D(**colormaps.distance_lines(*content)[1], show_labels=True, **points),
     )
 
-
-def _distances(
-    shape: tuple[int, int], origin: tuple[float, float], resolution: float, rover: tuple[float, float] | None
-) -> tuple[list[Any], dict[str, Any]]:
-    """The lines, and the points with their names."""
-    width = float(shape[0])
-    far, left = (start + count * resolution for start, count in zip(origin, shape[::-1], strict=True))
-    first, last = np.ceil(origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
-    ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
-    depths = (far - ahead) / resolution
-    marks, names = [(width, depth) for depth in depths], [f"{x:.0f} m" for x in ahead]
-    if rover is not None:
-        marks, names = [*marks, ((left - rover[1]) / resolution, (far - rover[0]) / resolution)], [*names, "rover"]
-    return [[(0.0, depth), (width, depth)] for depth in depths], {"positions": marks, "labels": names}
+    ways = colormaps.way_on(grid, shape, canvas.ways.get(grid.frame_id, []))
+    if ways:
+        canvas.log(
+            f"{path}/way", rr.LineStrips2D(ways, colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.2), draw_order=22.0)
+        )
 
 
 def _rover_place(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:

@@ -87,6 +87,7 @@ class RerunRecording:
             sized=frozenset(sized),
             matched=frozenset(disparities[-2:-1]),
             counts_bytes=settings.max_megabytes > 0,
+            hazard_limits={name: float(value) for name, _, value in (text.partition("=") for text in settings.limits)},
         )
         self._interval, self._rest = settings.every, 1e6 * settings.max_megabytes
         self._drawn = 0  # frames with images

@@ -52,6 +52,10 @@ class RerunSink:
         0, "file descriptor of a pipe to a viewer, which gets the recording while it is written; 0: none", low=0
     )
     without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
+    limits: tuple[str, ...] = parameter(
+        (),
+        "limits of layers, as elevation_map/step=0.17, which their scales show; `run` sets those of the hazard rule",
+    )
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     suffix = ".rrd"

@@ -56,6 +56,16 @@ def limits_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> dict
     return found
 
 
+def limits_of(rule: Binarise) -> dict[str, float]:
+    """Layer of an elevation map -> the value above which a cell is a hazard or unsure; slopes in degrees."""
+    if rule.method == "absolute":
+        return {"elevation": rule.rover.max_step}
+    slope = math.degrees(rule.rover.max_slope)
+    step = rule.rover.max_step - rule.height_margin
+    limits = {"step": step, "slope": slope, "steepness": slope, "roughness": rule.max_roughness}
+    return limits | {"variance": rule.max_sigma**2}
+
+
 def _height(rule: Binarise, value: float, name: str) -> Limit:
     """A height against a limit of the rover, less the margin."""
     limit, margin = getattr(rule.rover, name), rule.height_margin

@@ -8,7 +8,7 @@ import pytest
 import rerun as rr
 
 from recordings.sinks.loggers import same_view
-from stages.data import LEVEL_FRAME, Cell, Pose, StereoCamera, StereoFrame, Transform
+from stages.data import LEVEL_FRAME, Cell, ElevationMap, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
     HEIGHT,
     START,
@@ -159,6 +159,24 @@ def test_a_regional_map_is_drawn_in_its_own_frame_of_reference(tmp_path):
     )
     # 40 columns from x = 5: the rover, at x = 6, is 10 columns from the lower edge, and in the middle of 30 rows.
     assert spots[names.index("rover")] == [15.0, 30.0]
+
+
+def test_the_way_driven_is_drawn_on_a_regional_map(tmp_path):
+    def frame(number, position):
+        items = scene(START + number)
+        near = items["elevation_map"]
+        layers = {name: layer.copy() for name, layer in near.layers.items()}
+        region = replace(near, layers=layers, origin=(5.0, -1.5), frame_id="odom")  # 40 columns by 30 rows of 0.1 m
+        pose = replace(items["pose"], position=np.array(position))
+        return Record(START + number, {"pose": pose, "regional_map": region, "elevation_map": near})
+
+    way = ((1.0, 0.0, 0.0), (5.0, 0.0, 0.0), (6.0, 1.0, 0.0), (7.0, -1.0, 0.0))
+    streams = {"pose": Pose, "regional_map": ElevationMap, "elevation_map": ElevationMap}
+    path = record_of(tmp_path / "run.rrd", [frame(*item) for item in enumerate(way)], streams=streams)
+    drawn = [strips for *_, strips in rows(path, "/regional_map/relief/lines/way", "LineStrips2D:strips")]
+    np.testing.assert_allclose(drawn[-1], [[[15.0, 40.0], [5.0, 30.0], [25.0, 20.0]]])  # the first place is off the map
+    assert [len(strips[0]) for strips in drawn] == [2, 3]
+    assert "/elevation_map/relief/lines/way" not in entities(path)
 
 
 def test_what_is_unchanged_in_a_frame_stays_drawn(tmp_path):

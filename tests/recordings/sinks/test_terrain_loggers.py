@@ -2,9 +2,10 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
-from recordings.sinks.colormaps import REASON_LEGEND, SOURCE_LEGEND
+from recordings.sinks.colormaps import REASON_LEGEND, SOURCE_LEGEND, apply_palette
 from stages.data import LEVEL_FRAME, CellReason, ElevationMap, PixelOrigin, VoxelMap
 from tests.recordings.sinks.recorded_scene import START, Record, entities, record_of, rows, scene
 
@@ -50,6 +51,29 @@ def test_slopes_are_drawn_in_degrees_as_their_limits_are_given(tmp_path):
     ]
     buffer = np.array(rows(path, "/elevation_map/layers/slope", "DepthImage:buffer")[0][2][0], np.uint8)
     np.testing.assert_allclose(buffer.view(np.float16), 20.0, atol=0.02)
+
+
+def test_the_scale_of_a_layer_shows_the_limit_of_the_hazard_rule(tmp_path):
+    terrain = scene()["elevation_map"]
+    layers = dict.fromkeys(("elevation", "step"), terrain.layers["elevation"])
+    items = {"elevation_map": replace(terrain, layers=layers)}
+    path = record_of(tmp_path / "a.rrd", [Record(START, items)], limits=("elevation_map/step=0.17", "other/step=0.3"))
+    assert rows(path, "/elevation_map/layers/step/scale/text", "Points2D:labels")[0][2] == [
+        "0 m",
+        "limit 0.17 m",
+        "0.4 m",
+    ]
+    shown = rows(path, "/elevation_map/layers/step/scale", "Points2D:colors")[0][2][1]
+    (expected,) = apply_palette(np.array([0.17]), 0.0, 0.4, cv2.COLORMAP_TURBO).tolist()
+    assert [shown >> 24, shown >> 16 & 255, shown >> 8 & 255] == expected
+
+
+def test_a_run_gives_the_limits_of_its_hazard_rule(result):
+    def scale(layer):
+        return rows(result.with_suffix(".rrd"), f"/elevation_map/layers/{layer}/scale/text", "Points2D:labels")[0][2][1]
+
+    expected = {"step": "limit 0.17 m", "slope": "limit 20 deg", "roughness": "limit 0.06 m"}
+    assert {layer: scale(layer) for layer in expected} == expected
 
 
 def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path):
