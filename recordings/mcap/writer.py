@@ -6,6 +6,8 @@ images. The log gets its name when it is complete.
 
 from __future__ import annotations
 
+import hashlib
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -61,12 +63,13 @@ class Ros2Writer:
 
     profile = "ros2"
 
-    def __init__(self, path: Path, keep: bool = False, compression: str = "zstd") -> None:
+    def __init__(self, path: Path, keep: bool = False, compression: str = "zstd", digests: bool = False) -> None:
         self.path, self._keep = Path(path), keep
         self._kinds: dict[str, MessageKind] = {}
         self._schemas: dict[MessageKind, int] = {}
         self._channels: dict[tuple[str, int | None], tuple[int, MessageKind]] = {}
         self._counts: dict[int, int] = {}
+        self._digests: defaultdict[str, Any] | None = defaultdict(hashlib.sha256) if digests else None
         self._partial = self._temporary_name()
         with writing(self.path):
             self._file = self._open()
@@ -98,9 +101,16 @@ class Ros2Writer:
             large = len(data) >= MIN_OWN_CHUNK_BYTES
             if large:
                 self._writer.flush()
+            if self._digests is not None and copy_of is None:
+                self._digests[topic].update(b"%d %d " % (stamp, len(data)))
+                self._digests[topic].update(data)
             self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
             if large:
                 self._writer.flush()
+
+    def digests(self) -> dict[str, str]:
+        """Topic -> hexadecimal digest of its messages and stamps so far, if they are kept; without copied ones."""
+        return {topic: digest.hexdigest()[:32] for topic, digest in (self._digests or {}).items()}
 
     def attachment(self, name: str, media_type: str, content: bytes) -> None:
         """Append a file."""

@@ -137,7 +137,7 @@ class McapSink:
         self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
         self._kinds, self._owners, self._about = dict(streams), {}, about
         self._theirs = parents_in([Path(log) for log in self.inputs]) if self.inputs else {}
-        self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression)
+        self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression, digests=True)
         try:
             self._writer.metadata("roverflow", about if self.profile == "ros2" else {**about, "profile": self.profile})
             self._writer.attachment("pipeline.yaml", "application/yaml", _as_ran(about).encode())
@@ -190,6 +190,7 @@ class McapSink:
         for stream, finding in summary.get("findings", {}).items():
             counts[f"findings.{stream}"] = f"{finding['severity']}: {finding['sentence']}"
         writer.metadata("roverflow.run", counts)
+        writer.metadata("roverflow.digests", writer.digests())
         writer.close()
 
     def discard(self) -> None:

@@ -147,6 +147,25 @@ def test_the_metadata_contain_the_inputs_and_the_verdict_of_the_run(tmp_path):
     }  # fmt: skip
 
 
+def test_the_log_has_a_digest_of_each_topic(tmp_path):
+    def digests(path):
+        with path.open("rb") as file:
+            (found,) = (item.metadata for item in make_reader(file).iter_metadata() if item.name == "roverflow.digests")
+        return found
+
+    def drawn(name, step):
+        sink, one = McapSink(disparity_step=step), items(START)
+        sink.open(tmp_path / name, {stream: type(item) for stream, item in one.items()}, ABOUT)
+        sink.write(Record(START, one))
+        sink.close({})
+        return digests(tmp_path / name)
+
+    assert digests(write(tmp_path / "a", compression="lz4")) == digests(write(tmp_path / "b", compression="none"))
+    fine, coarse = drawn("c", 0.0), drawn("d", 1.0)
+    assert {"/nav/disparity", "/nav/elevation_map", "/tf", "/nav/diagnostics"} <= fine.keys() == coarse.keys()
+    assert {topic for topic in fine if fine[topic] != coarse[topic]} == {"/nav/disparity"}
+
+
 def test_timing_does_not_change_the_log(tmp_path):
     one, other = write(tmp_path / "a.mcap", 0.1), write(tmp_path / "b.mcap", 2.7)
     assert hashlib.sha256(one.read_bytes()).digest() == hashlib.sha256(other.read_bytes()).digest()
