@@ -12,6 +12,7 @@ instead; the table has the memory of each process and the CPU of scheduler and c
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -22,7 +23,7 @@ from pathlib import Path
 import psutil
 from distributed import Client
 
-from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.catalogue import NAME, Catalogue
 from recordings.simulator import Simulation, write_log
 
 LOGS, FEW = 12, 4
@@ -32,10 +33,11 @@ SETTINGS = ("-p", "rover", "--set", "disparities=96", "--workers-per-log", "1")
 
 @dataclass(frozen=True)
 class Fleet:
-    """Seconds of a whole fleet, of its runs, and of the CPU of their stages, surveys and sinks."""
+    """Seconds of a whole fleet, of its runs, of their CPU, and of the CPU of their stages, surveys and sinks."""
 
     seconds: float
     runs: float
+    cpu: float
     stages: float
 
 
@@ -43,12 +45,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser("python -m tests.bench.fleet", description=__doc__)
     parser.add_argument("--rounds", type=int, default=2, help="fleets of each kind (2)")
+    catalogue = "folder that gets the catalogue of one process, for tests.bench.schedule"
+    parser.add_argument("--catalogue", type=Path, metavar="DIR", help=catalogue)
     parser.add_argument("--tiny", type=int, metavar="LOGS", help="memory of the processes with that many tiny logs")
     options = parser.parse_args(arguments)
     if options.tiny:
         _tiny(options.tiny)
         return
-    rounds = options.rounds
+    rounds, keep = options.rounds, options.catalogue
     with tempfile.TemporaryDirectory() as folder:
         logs = Path(folder) / "logs"
         logs.mkdir()
@@ -62,6 +66,9 @@ def main(arguments: list[str] | None = None) -> None:
         for turn in range(rounds):
             for name, (chosen, processes) in kinds.items():
                 found[name].append(_fleet(chosen, Path(folder) / f"{name}{turn}", processes))
+        if keep:
+            keep.mkdir(parents=True, exist_ok=True)
+            shutil.copy(Path(folder) / "one0" / NAME, keep)
         gain = min(_at_once(every[-1], Path(folder) / f"plain{turn}") for turn in range(rounds))
     _print(*(min(fleets, key=lambda fleet: fleet.seconds) for fleets in found.values()), gain)
 
@@ -72,7 +79,9 @@ def _print(one: Fleet, two: Fleet, few: Fleet, gain: float) -> None:
     print(f"\nfleet of {LOGS} logs of 6 to {6 + 4 * (LOGS - 1)} frames, 640x480, rover, one thread a log")
     for name, value in {
         "one process, s": one.seconds,
+        "CPU of its runs, s": one.cpu,
         "two processes, s": two.seconds,
+        "CPU of their runs, s": two.cpu,
         "two processes over one": two.seconds / one.seconds,
         "two plain runs at once over one after the other": gain,
         "starting and ending a fleet, s": beside[one] - LOGS * overhead,
@@ -107,7 +116,7 @@ def _fleet(logs: list[Path], out: Path, processes: int) -> Fleet:
     begun = time.perf_counter()
     subprocess.run([sys.executable, "-m", "flow", *words], check=True, stdout=subprocess.DEVNULL)
     seconds, rows = time.perf_counter() - begun, Catalogue(out).rows()
-    return Fleet(seconds, sum(row["seconds"] for row in rows), sum(row["stage_seconds"] for row in rows))
+    return Fleet(seconds, *(sum(row[name] for row in rows) for name in ("seconds", "cpu_seconds", "stage_seconds")))
 
 
 def _tiny(logs: int) -> None:
