@@ -21,6 +21,8 @@ from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES
 
+_ROWS_AT_ONCE = 1000
+
 
 class Db3File:
     """A rosbag2 SQLite file open for reading.
@@ -111,15 +113,10 @@ class Db3File:
     def _rows(self) -> tuple[NDArray[np.int64], ...]:
         """Row, channel and log time, ns, of every message, in the order of recording."""
         columns = array("q"), array("q"), array("q")
-        cursor = self._database.cursor()
         try:
-            cursor.execute(
-                "SELECT rowid, CAST(topic_id AS INTEGER), CAST(timestamp AS INTEGER) FROM messages NOT INDEXED "
-                "WHERE topic_id IS NOT NULL AND timestamp IS NOT NULL ORDER BY rowid"
-            )
-            for row in cursor:  # one by one, so that an error loses none before it
-                for column, value in zip(columns, row, strict=True):
-                    column.append(value)
+            with suppress(sqlite3.Error):
+                self._read_rows(columns, _ROWS_AT_ONCE)
+            self._read_rows(columns, 1)  # what an error cut off
         except sqlite3.Error as error:
             held = counted(len(columns[0]), "message")
             reason = f"the file is cut or damaged ({sentence_of(error)}); before that it contains {held}"
@@ -131,16 +128,26 @@ class Db3File:
             self.lost.append(LostMessage(None, max(columns[2], default=0), reason))
         return found
 
+    def _read_rows(self, columns: tuple[array[int], ...], at_once: int) -> None:
+        """Add the rows after those in `columns`; an error loses less than `at_once` rows before it."""
+        found = self._database.execute(
+            "SELECT rowid, CAST(topic_id AS INTEGER), CAST(timestamp AS INTEGER) FROM messages NOT INDEXED "
+            "WHERE topic_id IS NOT NULL AND timestamp IS NOT NULL AND rowid > ? ORDER BY rowid",
+            (columns[0][-1] if columns[0] else -1 << 63,),
+        )
+        while rows := found.fetchmany(at_once):
+            for column, values in zip(columns, zip(*rows, strict=True), strict=True):
+                column.extend(values)
+
     def _data_or_reason(self, row: int) -> memoryview | str:
         """The bytes of the message in a row, or why it is lost."""
         try:
-            bounded = "SELECT length(data), iif(length(data) > ?, NULL, data) FROM messages WHERE rowid = ?"
-            ((size, data),) = self._database.execute(bounded, (MAX_CHUNK_BYTES, row)).fetchall()
-        except (sqlite3.Error, ValueError) as error:
+            with self._database.blobopen("messages", "data", row, readonly=True) as blob:
+                if len(blob) > MAX_CHUNK_BYTES:
+                    return f"row {row} of the file has {len(blob)} bytes; the limit is {MAX_CHUNK_BYTES}"
+                return memoryview(blob.read())
+        except (sqlite3.Error, ValueError, OverflowError) as error:
             return f"row {row} of the file is broken ({sentence_of(error)})"
-        if data is None and size is not None:
-            return f"row {row} of the file has {size} bytes; the limit is {MAX_CHUNK_BYTES}"
-        return memoryview(data) if isinstance(data, bytes) else f"row {row} of the file has no bytes"
 
     def _note_unwritten(self) -> None:
         """Note the messages that a stopped recorder left in a file of its own."""

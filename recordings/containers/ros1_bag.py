@@ -21,7 +21,7 @@ from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressor
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import MAX_CHUNK_BYTES, max_unpacked
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, Unpacking, max_unpacked
 from recordings.mcap.message_order import MAX_OPEN_BYTES
 
 _REINDEX = "`rosbag reindex` repairs a bag whose recorder was stopped"
@@ -36,7 +36,7 @@ class Ros1Bag:
     def __init__(self, path: Path) -> None:
         self.path, self.size = path, path.stat().st_size
         self.lost: list[LostMessage] = []
-        self._bag = Reader(path)
+        self._bag, self._unpacking = Reader(path), Unpacking()
         try:
             self._bag.open()
         except Exception as error:  # foreign bytes may fail the reader in any way
@@ -121,9 +121,10 @@ class Ros1Bag:
             packed = read_bytes(self._bag.bio, chunk.datasize)
             limit, records = max_unpacked(len(packed)), packed
             if chunk.decompressor is decompressors[Compression.BZ2.value]:
-                records = bz2.BZ2Decompressor().decompress(packed, limit + 1)
+                records = bytes(self._unpacking.of(packed, bz2.BZ2Decompressor().decompress, limit + 1))
             elif chunk.decompressor is decompressors[Compression.LZ4.value]:
-                records = lz4.frame.LZ4FrameDecompressor().decompress(packed, limit + 1)
+                unpack = lz4.frame.LZ4FrameDecompressor().decompress
+                records = bytes(self._unpacking.of(packed, unpack, limit + 1))
             if len(records) > limit:
                 raise ValueError(f"it unpacks from {len(packed)} to more than {limit} bytes")
             return records

@@ -15,9 +15,10 @@ from recordings.encodings.foxglove import adapter_of, with_header
 from recordings.encodings.json_text import json_decoder
 from recordings.encodings.protobuf import protobuf_decoder
 from recordings.errors import LogError
+from recordings.mcap.chunk import MAX_CHUNK_BYTES, Unpacking
 from recordings.ros1.codec import decoder_for as ros1_decoder
 from recordings.ros2.cdr import decoder_for as cdr_decoder
-from recordings.ros2.cdr import full_name
+from recordings.ros2.cdr import full_name, is_packed, plain
 from recordings.video.formats import VIDEO
 
 MAX_SCHEMA_BYTES = 1_000_000  # of all schemas of a log without comments; those in use have a fifth of it
@@ -28,8 +29,11 @@ ENCODINGS = ("cdr", "ros1", "protobuf", "json")
 Decoder = Callable[[bytes | memoryview], Any]
 
 
-def decoder_of(channel: Channel) -> tuple[str, Decoder]:
-    """The full ROS 2 name of a channel's type, and its decoder. Raises LogError if there is none."""
+def decoder_of(channel: Channel, unpacking: Unpacking | None = None) -> tuple[str, Decoder]:
+    """The full ROS 2 name of a channel's type, and its decoder. Raises LogError if there is none.
+
+    unpacking: that of all channels of the log.
+    """
     schema, encoding = channel.schema, channel.message_encoding
     if encoding not in ENCODINGS:
         raise LogError(f"its messages are in '{encoding}', which cannot be read; {', '.join(ENCODINGS)} can")
@@ -39,9 +43,13 @@ def decoder_of(channel: Channel) -> tuple[str, Decoder]:
     adapted = adapter_of(name)
     ros_name, adapt = adapted or (full_name(name), with_header if encoding in ("protobuf", "json") else None)
 
+    limit, unpacking = MAX_CHUNK_BYTES if ros_name in _IMAGES else MAX_MESSAGE_BYTES, unpacking or Unpacking()
+
     def decoded(data: bytes | memoryview) -> Any:
-        if len(data) > MAX_MESSAGE_BYTES and ros_name not in _IMAGES:
-            raise LogError(f"it has {len(data)} bytes; the limit of messages other than images is {MAX_MESSAGE_BYTES}")
+        if encoding == "cdr" and is_packed(data):
+            data = unpacking.of(data, plain, limit + 1)
+        if len(data) > limit:
+            raise LogError(f"it has more than {limit} bytes; messages other than images have at most so many")
         return decode(data) if adapt is None else adapt(decode(data))
 
     return ros_name, decoded

@@ -9,15 +9,17 @@ from typing import Any
 
 from recordings.errors import LogError
 
-_MAX_VALUES, _MAX_OBJECTS = 4_000_000, 100_000  # of a message; they take far more memory than their text
+# Of a message; they take far more memory than their text. What is counted may also be in strings.
+_MAX_COUNTS = {"values": (",[", 4_000_000), "objects": ("{", 100_000), "names": (":", 400_000)}
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 
 def json_decoder(data: bytes | memoryview) -> Any:
     """The message of a JSON object. Raises LogError for anything else."""
     text = bytes(data)
-    if text.count(b"{") > _MAX_OBJECTS or sum(map(text.count, (b",", b"["))) > _MAX_VALUES:
-        raise LogError(f"it has more than {_MAX_VALUES} values or {_MAX_OBJECTS} objects")
+    for name, (marks, limit) in _MAX_COUNTS.items():
+        if sum(text.count(mark.encode()) for mark in marks) > limit:
+            raise LogError(f"it has more than {limit} {name}")
     try:
         message = json.loads(text, object_hook=_object)
         if _SURROGATE.search(text):  # a half of one is no character, and no output could contain it

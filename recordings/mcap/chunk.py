@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
@@ -23,12 +23,30 @@ from recordings.mcap.index import RECORD, Index, read_at
 MAX_CHUNK_BYTES = 1 << 28  # of a chunk or message, unpacked; recorders make chunks of a few MB
 MAX_RATIO = 200  # of unpacked to packed bytes; more is a hostile file
 _FREE_BYTES, _FREE_FILE_BYTES = 1 << 26, 1 << 30  # to which any chunk, and any file, may unpack
+_FREE_PARTS_BYTES = 1 << 31  # likewise; some parts are unpacked several times
 CHUNK_HEAD_BYTES = 128  # of a chunk record; they contain its length
+
+Buffer = bytes | memoryview
 
 _CHUNK = struct.Struct("<QQQII")  # start time, end time, size, CRC, length of the compression's name
 _MAX_PADDING_BYTES = 64  # that may follow a chunk's stated content
 _BLOCK_BYTES = 1 << 20
 _CHUNK_PATTERN = re.compile(rb"\x06(?=.{5}\0{3}.{28}(?:\x04\0{3}zstd|\x03\0{3}lz4|\0{4}))", re.DOTALL)
+
+
+class Unpacking:
+    """Unpacks the parts of a file, one at a time, as long as all together have the size of a recording's."""
+
+    def __init__(self) -> None:
+        self._left = _FREE_PARTS_BYTES
+
+    def of(self, packed: Buffer, unpack: Callable[[Buffer, int], Buffer], size: int) -> Buffer:
+        """The first `size` bytes by `unpack`. Raises LogError where there are too many already."""
+        if self._left < 0:
+            raise LogError(f"the parts of the log unpack to over {MAX_RATIO} times their size: no recording does")
+        found = unpack(packed, size)
+        self._left += MAX_RATIO * len(packed) - len(found)
+        return found
 
 
 def max_unpacked(packed: int) -> int:

@@ -106,9 +106,14 @@ def store_of(schema_name: str, schema_encoding: str, text: bytes) -> SharedTypes
     return store
 
 
+def is_packed(data: bytes | memoryview) -> bool:
+    """Whether rosbag2 compressed a message by itself."""
+    return data[: len(_ZSTD_MAGIC)] == _ZSTD_MAGIC
+
+
 def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memoryview:
     """At least the first `size` bytes of a message, decompressed if rosbag2 compressed it by itself (zstd)."""
-    if data[: len(_ZSTD_MAGIC)] != _ZSTD_MAGIC:
+    if not is_packed(data):
         return data
     whole, limit = zstandard.frame_content_size(data), max_unpacked(len(data))
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:

@@ -35,7 +35,7 @@ _BAYER = {
     "bayer_grbg": cv2.COLOR_BayerGRBG2RGB,
 }
 _MAX_PADDING_BYTES = 1024  # after the end of a compressed image
-MAX_PIXELS = 32_000_000  # of an image, by default; navigation cameras have at most 20 million
+MAX_PIXELS = 21_000_000  # of an image, by default; navigation cameras have at most 20 million
 _MAX_SCANS = 64  # of a progressive JPEG, each of which takes the time of a picture; encoders make at most 12
 # Of these only the brightness is read. Encoding -> (bytes of a pixel in a row, place of the first brightness)
 _LUMA = {

@@ -16,6 +16,7 @@ from recordings.containers.container import LostMessage, MessageSchema, RawMessa
 from recordings.containers.recording import Recording
 from recordings.encodings.decoding import MAX_SCHEMA_BYTES, Decoder, decoder_of, weight_of
 from recordings.errors import LogError, sentence_of
+from recordings.mcap.chunk import Unpacking
 from recordings.ros2.from_msg import frame_of
 from recordings.video.decoder import PixelReader, VideoDecoder, begins_video, reader_of
 
@@ -73,7 +74,7 @@ class DecodedTopics:
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
-        weights = dict[MessageSchema, int]()
+        weights, unpacking = dict[MessageSchema, int](), Unpacking()
         for place, (number, channel) in enumerate(file.channels.items()):
             if place >= MAX_CHANNELS:
                 self.undecodable_channels[number] = f"the log has more than {MAX_CHANNELS} channels"
@@ -83,7 +84,7 @@ class DecodedTopics:
             try:
                 if sum(weights.values()) > MAX_SCHEMA_BYTES:
                     raise LogError(f"the schemas of the log have more than {MAX_SCHEMA_BYTES} bytes")
-                self.schemas[channel.topic], self.decoders[number] = decoder_of(channel)
+                self.schemas[channel.topic], self.decoders[number] = decoder_of(channel, unpacking)
             except LogError as error:
                 self.undecodable_channels[number] = str(error)
 
@@ -139,7 +140,8 @@ def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
     try:
         return make(*arguments)
     except LogError as error:
-        return error
+        error.__cause__ = error.__context__ = None  # they hold the message
+        return error.with_traceback(None)
     except (AttributeError, TypeError) as error:
         return LogError(f"its content does not match the name of its type ({sentence_of(error)})")
     except Exception as error:

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import zstandard
 from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
@@ -18,7 +19,9 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from recordings import McapSource
 from recordings.containers.container import Channel, MessageSchema
 from recordings.encodings.decoding import MAX_MESSAGE_BYTES, decoder_of
+from recordings.encodings.json_text import json_decoder
 from recordings.errors import LogError
+from recordings.mcap import chunk
 from recordings.ros2.cdr import make
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.ros2.tilt_from_msg import AngleField
@@ -224,8 +227,23 @@ def test_a_picture_of_many_scans_is_refused_before_it_is_decoded():
 
 def test_only_images_may_have_many_bytes():
     decode = decoder_of(Channel(1, "/tf", "json", MessageSchema("foxglove.FrameTransforms", "jsonschema", b"")))[1]
-    with pytest.raises(LogError, match="it has 4000001 bytes; the limit of messages other than images is 4000000"):
+    with pytest.raises(LogError, match="it has more than 4000000 bytes; messages other than images have"):
         decode(b" " * (MAX_MESSAGE_BYTES + 1))
+
+
+def test_json_of_many_names_is_refused_before_it_is_parsed():
+    names = b",".join(b'"%x":1' % number for number in range(400_002))
+    with pytest.raises(LogError, match="it has more than 400000 names"):
+        json_decoder(b"{%s}" % names)
+
+
+def test_compressed_messages_may_unpack_to_200_times_their_size_in_all(monkeypatch):
+    monkeypatch.setattr(chunk, "_FREE_PARTS_BYTES", 1_000_000)
+    decode = decoder_of(Channel(1, "/name", "cdr", MessageSchema("std_msgs/msg/String", "ros2msg", b"string data")))[1]
+    packed = zstandard.compress(b"\0\1\0\0" + struct.pack("<I", 400_000) + bytes(400_000))
+    assert [len(decode(packed).data) for _ in range(3)] == [399_999] * 3
+    with pytest.raises(LogError, match="the parts of the log unpack to over 200 times their size"):
+        decode(packed)
 
 
 def test_a_log_of_thousands_of_topics_opens_quickly(tmp_path):

@@ -13,6 +13,7 @@ import pytest
 import zstandard
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from rosbags.rosbag1 import Writer as BagWriter
 
 from recordings.errors import LogError
 from recordings.mcap import chunk, message_order, walk
@@ -22,6 +23,7 @@ from recordings.ros2.cdr import make
 from tests.conftest import rewrite
 from tests.fuzz.isolation import isolated
 from tests.fuzz.targets import read_events, read_info, read_log
+from tests.recordings.encodings.rewritten import ROS1
 from tests.recordings.sample_log import LEFT, START, TILT, essence, items_of, write_sample
 
 Extra = Callable[[Writer, dict[str, int]], object]
@@ -62,15 +64,15 @@ def images(data: bytes, size: int) -> Callable[[Path], Path]:
     return lambda folder: write_sample(folder / "log.mcap", edit)
 
 
-def png(size: int) -> bytes:
-    """A black picture."""
+def png(size: int, bits: int = 8, colour: int = 0) -> bytes:
+    """A black picture; colour: 0 gray, 6 RGBA."""
 
     def part(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    packer, rows = zlib.compressobj(1), bytes((1 + size) * 100)
+    packer, rows = zlib.compressobj(1), bytes((1 + size * bits // 8 * (4 if colour else 1)) * 100)
     packed = b"".join(packer.compress(rows) for _ in range(size // 100)) + packer.flush()
-    head = struct.pack(">IIBBBBB", size, size, 8, 0, 0, 0, 0)
+    head = struct.pack(">IIBBBBB", size, size, bits, colour, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", packed) + part(b"IEND", b"")
 
 
@@ -116,6 +118,18 @@ def messages_of(data: bytes, count: int) -> Extra:
     ]
 
 
+def bag(folder: Path) -> Path:
+    """A ROS 1 bag whose chunks unpack to 60 MB each."""
+    path = folder / "log.mcap"
+    writer = BagWriter(path)
+    writer.set_compression(BagWriter.CompressionFormat.BZ2)
+    with writer:
+        camera = writer.add_connection(LEFT, "sensor_msgs/msg/Image", typestore=ROS1)
+        for number in range(200):
+            writer.write(camera, START + number, bytes(60 << 20))
+    return path
+
+
 def schema_of(text: str) -> Extra:
     """A second Imu with this definition."""
 
@@ -147,6 +161,9 @@ SMALL = {
 }
 LARGE = {
     "png of 30000x30000": lambda: images(png(30000), 30000),
+    "png of 16 bits": lambda: images(png(4500, bits=16, colour=6), 4500),
+    "messages of 60 GB in all": lambda: with_extra(messages_of(packed(60, states_size=True), 1000)),
+    "bag of 12 GB": lambda: bag,
     "messages of 4 GB": lambda: with_extra(messages_of(packed(4000, states_size=False), 5)),
     "messages that state 4 GB": lambda: with_extra(messages_of(packed(4000, states_size=True), 5)),
     "comments of 5 MB": lambda: with_extra(schema_of("# x\n" * 1_300_000)),
