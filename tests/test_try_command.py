@@ -57,6 +57,7 @@ def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path
     assert errors.keys() == {"A", "B", "C"}
     assert errors["B"] > 1.5 * errors["C"]
     charts = {chunk.entity_path: chunk for chunk in rr.chunk.RrdReader(str(tmp_path / "try.rrd")).stream()}
+    assert {"/errors/A", "/errors/B", "/errors/C"} <= charts.keys()
     (blob,) = charts["/sweep/2"].to_record_batch().column("EncodedImage:blob").to_pylist()[0]
     picture = cv2.imdecode(np.array(blob, np.uint8), cv2.IMREAD_COLOR)
     np.testing.assert_array_equal(

@@ -12,6 +12,7 @@ from recordings.export.page_layout import add_bar, add_legend, map_page, page_of
 from recordings.export.png_pages import disparity_page, relief_page, verdict_page
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_layers, read_occupancy_grid
 from recordings.sinks import colormaps
+from recordings.sinks.png import png
 from stages.data import Array, Cell, ElevationMap, NavigationMap
 
 DISPARITY_LIMIT = 1.0  # px at the ends of the scale
@@ -40,6 +41,16 @@ def pages(schema: str, one: Any, other: Any) -> tuple[Array, Array, Array] | Non
     if schema not in _PAGES or (schema == _GRID_MAP and "elevation" not in read_layers(one)):
         return None
     return _PAGES[schema](one, other)
+
+
+def error_page(estimate: Array, truth: Array) -> bytes | None:
+    """Disparities less the true ones, (H, W), px, as a page in a PNG file; None for images of two sizes."""
+    if estimate.shape != truth.shape:
+        return None
+    page = page_of(_change_colors(truth, estimate, DISPARITY_LIMIT), "error of the disparity, px")
+    others = {1: ("not found", ONLY_ONE[1][1]), 2: ("no truth", ONLY_ONE[2][1])}
+    add_bar(page, -DISPARITY_LIMIT, DISPARITY_LIMIT, lambda values: signed_colors(values, DISPARITY_LIMIT), others)
+    return png(page)
 
 
 def signed_colors(change: Array, limit: float) -> Array:

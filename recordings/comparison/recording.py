@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,7 @@ class DiffRecording:
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.left_out = 0
+        self.errors: Sequence[tuple[str, int, bytes]] = ()  # variant, stamp and page of errors against the truth
         self._names = dict[str, str]()
         self._drawing: list[tuple[str, int, Future[tuple[bytes, ...]]]] = []
         self._threads = ThreadPoolExecutor(2, thread_name_prefix="pages")
@@ -81,6 +82,9 @@ class DiffRecording:
                 stream.set_time(FRAME, sequence=self.stamps.index(stamp))
                 for side, picture in zip(_SIDES, sides, strict=True):
                     stream.log(f"{topic}/{side}", rr.EncodedImage(contents=picture, media_type="image/png"))
+            for variant, stamp, picture in self.errors:
+                stream.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
+                stream.log(f"errors/{variant}", rr.EncodedImage(contents=picture, media_type="image/png"))
             stream.send_blueprint(self._blueprint([] if sweep is None else [sweep.views()]))
             stream.flush()
             stream.disconnect()
@@ -89,16 +93,19 @@ class DiffRecording:
         paths = dict[str, dict[str, None]]()
         for path, _, _ in self.pictures:
             paths.setdefault(path[: path.index("/nav/")], {})[path] = None
+        variants = {variant: [_beside(path, variant[1:] or "B") for path in own] for variant, own in paths.items()}
         tabs: list[rrb.Container] = [
             *plots,
-            *(
-                rrb.Tabs(*(_beside(path, variant[1:] or "B") for path in own), name=self._names[variant])
-                for variant, own in paths.items()
-            ),
+            *(rrb.Tabs(*topics, name=self._names[variant]) for variant, topics in variants.items()),
         ]
+        if len(variants) == 1:
+            tabs[len(plots) :] = next(iter(variants.values()))
+        if wrong := dict.fromkeys(variant for variant, _, _ in self.errors):
+            views = [rrb.Spatial2DView(origin=f"errors/{variant}", name=f"{variant} less truth") for variant in wrong]
+            tabs.append(rrb.Grid(*views, grid_columns=min(3, len(views)), name="errors of disparity"))
         table = rrb.TextDocumentView(origin="tables", name="what differs")
         return rrb.Blueprint(
-            rrb.Vertical(rrb.Tabs(*tabs) if tabs[1:] else tabs[0], table, row_shares=[3, 1]) if tabs else table,
+            rrb.Vertical(rrb.Tabs(*tabs), table, row_shares=[3, 1]) if tabs else table,
             rrb.TimePanel(state="collapsed", timeline=CLOCK),
             collapse_panels=True,
         )

@@ -80,6 +80,9 @@ def run(options: argparse.Namespace) -> int:
         errors = _errors(paths, options.log[0])
         if errors:
             say("\n" + "\n".join("  ".join(f"{cell:>12}" for cell in row) for row in errors))
+            from recordings.comparison.truth import error_pages
+
+            recording.errors = [*error_pages(paths, options.log[0])]
             tables = ["## Errors", *_markdown_rows(errors), *tables]
             recording.write(out, title, "\n\n".join(tables), _sweep(setting, errors, differences))
             say(f"\nadded the errors to {out}")
