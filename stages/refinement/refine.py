@@ -39,8 +39,8 @@ MAX_GRADIENT = 0.5  # px/px, of an accepted plane
 MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
 COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
 BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
-DEPTH_EDGE = 2.0  # px between neighbours at an edge of depth
-DEPTH_EDGE_GRAY = 10.0  # gray levels over which a neighbour's weight falls to 1/e there
+DEPTH_EDGE = 1.0  # px between neighbours at an edge of depth
+DEPTH_EDGE_GRAY = 15.0  # gray levels over which a neighbour's weight falls to 1/e there
 # Fitted to eight Middlebury scenes and simulated frames, which count alike; tests/study.py prints the true shares.
 TRUST = Trust(
     agreed=(0.955, 0.993, 0.998),
@@ -107,7 +107,7 @@ class Refine(Stage):
         3, "radius and spatial sigma of the bilateral filter; 0: none", unit="px", low=0, high=32
     )
     edge_radius: int = parameter(
-        3, "radius of the weighted median that moves depth edges to edges of the image; 0: none", unit="px", low=0,
+        3, "radius of the windows that move depth edges to where the images have them; 0: none", unit="px", low=0,
         high=16,
     )  # fmt: skip
     support: bool = parameter(True, "whether matches of weak texture move to the planes of windows that grow")
@@ -135,7 +135,7 @@ class Refine(Stage):
         within = extent(smoothed, self.threads)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image)
-        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide)
+        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide, right)
         refined, sigma, consistent = self._supported(sharp, kinds != KEPT, guide, right)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
@@ -218,10 +218,10 @@ class Refine(Stage):
             consistent &= found.correlation >= F32(self.min_correlation)
         return found.pixels, found.sigma, consistent
 
-    def _sharpened(self, pixels: Array, guessed: Array, guide: Array) -> Array:
+    def _sharpened(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
         if self.edge_radius == 0:
             return pixels
-        return sharpen_edges(pixels, guessed, guide, self.edge_radius, DEPTH_EDGE, DEPTH_EDGE_GRAY, self.threads)
+        return sharpen_edges(pixels, guessed, guide, right, self.edge_radius, DEPTH_EDGE, DEPTH_EDGE_GRAY, self.threads)
 
 
 def _saturated(image: Array, guide: Array, level: int, threads: int) -> Array:

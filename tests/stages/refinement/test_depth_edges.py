@@ -1,4 +1,4 @@
-"""Depth edges: the weighted median equals the plain reference and moves an edge onto the image edge."""
+"""Depth edges: the choice of a surface equals the plain reference and moves an edge to where the images have it."""
 
 import numpy as np
 import pytest
@@ -8,18 +8,20 @@ from hypothesis import strategies as st
 from stages.refinement.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
 from stages.refinement.refine import DEPTH_EDGE, DEPTH_EDGE_GRAY
 
+RULE = 3, DEPTH_EDGE, DEPTH_EDGE_GRAY
 
-def sharpened(disparity, image):
-    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY)
+
+def sharpened(disparity, left, right=None):
+    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), left, left if right is None else right, *RULE)
 
 
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 5), st.integers(0, 2**31))
-def test_the_median_equals_its_reference(height, width, radius, seed):
+def test_the_choice_equals_its_reference(height, width, radius, seed):
     random = np.random.default_rng(seed)
-    disparity = np.float32(random.choice([-900.0, 3.0, 40.0], (height, width)) + random.normal(0, 0.2, (height, width)))
+    disparity = np.float32(random.choice([-900.0, 3.0, 5.0], (height, width)) + random.normal(0, 0.2, (height, width)))
     disparity[random.random(disparity.shape) < 0.2] = np.nan
-    image = random.integers(0, 60, (height, width), np.uint8)
-    everything = disparity, random.random(disparity.shape) < 0.3, image, radius, DEPTH_EDGE, DEPTH_EDGE_GRAY
+    left, right = random.integers(0, 60, (2, height, width), np.uint8)
+    everything = disparity, random.random(disparity.shape) < 0.3, left, right, radius, *RULE[1:]
     sharp = sharpen_edges(*everything)
     np.testing.assert_array_equal(sharp, sharpen_edges_reference(*everything))
     np.testing.assert_array_equal(sharp, sharpen_edges(*everything, threads=2))
@@ -30,8 +32,25 @@ def test_a_misplaced_depth_edge_moves_onto_the_image_edge():
     image[:, 30:] = 140
     truth = np.where(image > 100, np.float32(30), np.float32(10))
     off = truth.copy()
-    off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 21
+    off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 10
     assert np.array_equal(sharpened(off, image), truth)
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.85, 12.0)])
+def test_texture_moves_an_edge_where_brightness_shows_none(gain, offset):
+    """Both surfaces have the same brightness and texture; only the second image contains the edge."""
+    random = np.random.default_rng(3)
+    right = random.normal(120, 25, (60, 90))
+    truth = np.full(right.shape, 4, np.float32)
+    truth[10:40, 40:70] = 9
+    columns = np.arange(90) - truth.astype(int)
+    left = np.take_along_axis(right, columns.clip(0), axis=1)
+    images = (image.clip(0, 255).astype(np.uint8) for image in (left, gain * right + offset))
+    wide = truth.copy()
+    wide[10:40, 70] = 9  # one column too wide on its right, which both cameras see
+    moved = sharpened(wide, *images)
+    assert np.count_nonzero(moved[10:40, 70] != 4) <= 2
+    assert np.count_nonzero(moved != truth) <= 0.2 * np.count_nonzero(wide != truth) + 8
 
 
 def test_ground_without_a_jump_and_unknown_pixels_stay():
@@ -49,13 +68,13 @@ def test_guesses_do_not_move_matches_but_follow_them():
     disparity, image = np.full((20, 20), 10, np.float32), np.full((20, 20), 90, np.uint8)
     disparity[9:11, 9:11] = 30
     guessed = disparity == 10
-    assert np.array_equal(sharpen_edges(disparity, guessed, image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY), disparity)
-    assert (sharpen_edges(disparity, ~guessed, image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY) == 10).all()
+    assert np.array_equal(sharpen_edges(disparity, guessed, image, image, *RULE), disparity)
+    assert (sharpen_edges(disparity, ~guessed, image, image, *RULE) == 10).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1)])
 def test_images_of_a_row_or_a_column_work(shape):
     disparity = np.arange(np.prod(shape), dtype=np.float32).reshape(shape) * 4
     image = np.zeros(shape, np.uint8)
-    everything = disparity, np.zeros(shape, bool), image, 3, DEPTH_EDGE, DEPTH_EDGE_GRAY
+    everything = disparity, np.zeros(shape, bool), image, image, *RULE
     assert np.array_equal(sharpen_edges(*everything), sharpen_edges_reference(*everything))

@@ -24,6 +24,9 @@ def box():
     truth = np.where(inside, 40, 10 + 0.05 * y)
     gray = np.where(inside, 190, 70) + rng.integers(-6, 7, SHAPE)
     image = gray.astype(np.uint8)
+    right = np.roll(image, -10, axis=1)  # texture where the left image has none
+    for part in (~inside, inside):  # the nearer one last
+        right[y[part], np.rint(x - truth).astype(int).clip(0)[part]] = image[part]
     pixels = (truth + rng.normal(0, 0.25, SHAPE)).astype(np.float32)
     pixels[rng.random(SHAPE) < 0.15] = np.nan
     pixels[30:90, 35:61] = np.nan  # hidden from the right camera, left of the box
@@ -31,7 +34,7 @@ def box():
     source = np.where(np.isfinite(pixels), PixelOrigin.MEASURED, PixelOrigin.UNKNOWN).astype(np.uint8)
     confidence = np.where(np.isfinite(pixels), 0.8, 0).astype(np.float32)
     camera = StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT)
-    frame = StereoFrame(5, image, image, camera)
+    frame = StereoFrame(5, image, right, camera)
     return frame, Disparity(5, pixels, source, confidence, camera=camera), truth.astype(np.float32)
 
 
