@@ -45,8 +45,8 @@ _Part = rrb.View | rrb.Container
 # The places of the layout. Derived images have another size than the camera's; OWN_... are of the user's own types.
 Panel = Enum(
     "Panel",
-    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE MATCH_CONFIDENCE CONFIDENCE SIGMA DIFFERENCE "
-    "CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE "
+    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE MATCH_CONFIDENCE CONFIDENCE SIGMA DEPTH "
+    "DIFFERENCE CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE "
     "OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
 )
 
@@ -132,7 +132,8 @@ def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
     disparities, sources = _flat_views(drawn, Panel.DISPARITY), _flat_views(drawn, Panel.SOURCE)
     parts = [
         *_image_tabs(drawn), _tabs(_flat_views(drawn, Panel.DIFFERENCE)), _tabs(reversed(_superpixels(drawn))),
-        _tabs(disparities[-2::-1]), _tabs(disparities[-1:]), _tabs(sources[-2::-1]), _tabs(sources[-1:]),
+        _tabs(disparities[-2::-1]), _tabs([*disparities[-1:], *_flat_views(drawn, Panel.DEPTH)]),
+        _tabs(sources[-2::-1]), _tabs(sources[-1:]),
         *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.MATCH_CONFIDENCE, Panel.CONFIDENCE, Panel.SIGMA)),
         _panel(drawn, Panel.MATCHES, MATCHED, in_tab=False),
     ]  # fmt: skip
@@ -228,7 +229,7 @@ def _images(drawn: Specs) -> _Part | None:
     parts = [
         *_image_tabs(drawn),
         _tabs(disparities[-2::-1]),
-        _tabs(disparities[-1:]),
+        _tabs([*disparities[-1:], *_flat_views(drawn, Panel.DEPTH)]),
         _tabs(reversed(_superpixels(drawn))),
         _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, *ERRORS)]),
         _tabs(_flat_views(drawn, Panel.OWN_IMAGE)),

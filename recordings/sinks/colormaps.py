@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from recordings.scoring.metrics import cell_centres
-from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin
+from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin
 
 Rgb = tuple[int, int, int]
 Point = tuple[float, float]
@@ -185,6 +185,14 @@ def distance_lines(
     if rover is not None:
         marks, names = [*marks, ((left - rover[1]) / resolution, (far - rover[0]) / resolution)], [*names, "rover"]
     return [[(0.0, depth), (width, depth)] for depth in depths], {"positions": marks, "labels": names}
+
+
+def rover_place(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:
+    """x and y of the rover in a grid, m: the origin of frame `level`; None if that is not known."""
+    if grid.frame_id == LEVEL_FRAME:
+        return 0.0, 0.0
+    level = getattr(grid, "level", None)
+    return None if level is None else (float(level.translation[0]), float(level.translation[1]))
 
 
 def way_on(grid: ElevationMap | NavigationMap, shape: tuple[int, int], way: Sequence[Point]) -> list[list[Point]]:

@@ -48,6 +48,7 @@ DIFFERENCE_STEPS = 0.25  # the difference of the images is drawn to 4 gray level
 MAX_DIFFERENCE = 32  # gray levels, the upper end of the scale of the images' difference
 MAX_SIGMA = 0.5  # px, the upper end of the scale of the disparities' standard deviation
 MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
+MAX_DEPTH = 16.0  # m, the upper end of the scale of depths
 MIN_DEPTH = 0.2  # m in front of the camera, of what is drawn over its image
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
 CAMERA_RGB: Rgb = (255, 210, 60)
@@ -114,6 +115,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     if stream in canvas.full_size:
         _log_confidence(canvas, ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence"), disparity)
         _log_sigma(canvas, stream, disparity)
+        _log_depth(canvas, stream, disparity)
     elif stream in canvas.matched and disparity.segments is None:
         title = f"{stream}: confidence of the match"
         _log_confidence(canvas, ViewSpec(Panel.MATCH_CONFIDENCE, stream, "confidence", title), disparity)
@@ -145,6 +147,15 @@ def _log_sigma(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         )
         values = np.where(np.isnan(pixels), np.float32(np.nan), sigma).astype(np.float16)
         canvas.log_values(values, (0.0, MAX_SIGMA), ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma"), "px")
+
+
+def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
+    """The depth of every n-th pixel, in front of the left camera."""
+    if (camera := disparity.camera) is not None:
+        shifted = colormaps.every_nth(disparity.pixels, canvas.small_width) + np.float32(camera.cx_right - camera.cx)
+        depth = camera.fx * camera.baseline / np.where(shifted > 0, shifted, np.float32(np.nan))
+        view = ViewSpec(Panel.DEPTH, stream, "depth", f"{stream}: depth")
+        canvas.log_values(depth.astype(np.float16), (0.0, MAX_DEPTH), view, "m")
 
 
 def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> None:
@@ -370,7 +381,7 @@ def _frame_suffix(frame_id: str) -> str:
 
 def _log_distances(canvas: Canvas, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
     """Lines across a bird's-eye view at every second metre of x, with their distances; the rover's place and way."""
-    content, thin = (shape, grid.origin, grid.resolution, _rover_place(grid)), rr.Radius.ui_points(0.6)
+    content, thin = (shape, grid.origin, grid.resolution, colormaps.rover_place(grid)), rr.Radius.ui_points(0.6)
     lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
     points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
     canvas.keep(path, content, lambda: rr.LineStrips2D(colormaps.distance_lines(*content)[0], **lines))
@@ -385,11 +396,3 @@ def _log_distances(canvas: Canvas, path: str, shape: tuple[int, int], grid: Elev
         canvas.log(
             f"{path}/way", rr.LineStrips2D(ways, colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.2), draw_order=22.0)
         )
-
-
-def _rover_place(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:
-    """x and y of the rover in a grid, m: the origin of frame `level`; None if that is not known."""
-    if grid.frame_id == LEVEL_FRAME:
-        return 0.0, 0.0
-    level = getattr(grid, "level", None)
-    return None if level is None else (float(level.translation[0]), float(level.translation[1]))

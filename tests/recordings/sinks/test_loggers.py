@@ -179,6 +179,21 @@ def test_the_way_driven_is_drawn_on_a_regional_map(tmp_path):
     assert "/elevation_map/relief/lines/way" not in entities(path)
 
 
+def test_the_depth_of_the_last_disparity_is_under_the_cursor(tmp_path):
+    items = scene()
+    pixels = np.full((48, 64), 4.0, np.float32)
+    pixels[:8], pixels[8:16] = np.nan, 0.0
+    camera = StereoCamera(80, 80, 31.5, 23.5, 0.2, 64, 48, cx_right=33.5)
+    items["disparity"] = replace(items["disparity"], pixels=pixels, camera=camera, sigma=None)
+    path = record_of(tmp_path / "run.rrd", [Record(START, items)], max_width=180)
+    ((_, _, (buffer,)),) = rows(path, "/disparity/depth", "DepthImage:buffer")
+    depth = np.array(buffer, np.uint8).view(np.float16).reshape(48, 64)
+    assert np.isnan(depth[:8]).all()
+    np.testing.assert_allclose(depth[8:16], 80 * 0.2 / 2.0, rtol=1e-3)
+    np.testing.assert_allclose(depth[16:], 80 * 0.2 / 6.0, rtol=1e-3)
+    assert not [entity for entity in entities(path) if entity.startswith("/matched/depth")]
+
+
 def test_what_is_unchanged_in_a_frame_stays_drawn(tmp_path):
     def frame(number):
         items = scene(START + number)
