@@ -14,7 +14,7 @@ import itertools
 import cv2
 import numpy as np
 
-from stages.compiled.jit import borrowing_kernel, part
+from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
@@ -43,30 +43,10 @@ def sharpen_edges(
     padded = cv2.copyMakeBorder(disparity, *border, value=np.nan)
     matches = cv2.copyMakeBorder(np.where(guessed, F32(np.nan), disparity), *border, value=np.nan)
     taps = _taps(radius) @ [padded.shape[1], 1]
-    window = (
-        cv2.copyMakeBorder(left, *border, value=0),
-        taps,
-        _weights(brightness),
-        F32(ODDS_OF_WINDOW / len(taps) / UNIT),
-    )
+    guide, weight = cv2.copyMakeBorder(left, *border, value=0), F32(ODDS_OF_WINDOW / len(taps) / UNIT)
     images = left, right, *_exposure(disparity, guessed, left, right)
-
-    def work(first: int, end: int) -> None:
-        _sharpen(
-            padded,
-            matches,
-            guessed,
-            *window,
-            *images,
-            radius,
-            F32(jump),
-            np.empty(sharp.shape[1], bool),
-            sharp,
-            first,
-            end,
-        )
-
-    by_bands(shared_by(threads), len(disparity), work)
+    given = padded, matches, guessed, guide, taps, _weights(brightness), weight, *images, radius, F32(jump)
+    by_bands(shared_by(threads), len(disparity), lambda first, end: _sharpen(*given, sharp, first, end))
     return sharp
 
 
@@ -96,13 +76,13 @@ def _exposure(disparity: Array, guessed: Array, left: Array, right: Array) -> tu
     return F32(gain), F32(middle[0] - gain * middle[1])
 
 
-@borrowing_kernel
+@kernel
 def _sharpen(
-    disparity, matches, guessed, guide, taps, table, weight, left, right, gain, offset, radius, jump, jumps, sharp,
-    first, end,
+    disparity, matches, guessed, guide, taps, table, weight, left, right, gain, offset, radius, jump, sharp, first, end
 ):  # fmt: skip
     """Sharpen rows first to end; disparity, matches, guide have a border of `radius` px, taps are offsets in memory."""
     width, stride = sharp.shape[1], disparity.shape[1]
+    jumps = np.empty(width, np.bool_)
     everything, certain, levels = disparity.reshape(-1), matches.reshape(-1), guide.reshape(-1)
     for y in range(first, end):
         _find_jumps(disparity, y + radius, radius, jump, jumps)
