@@ -1,13 +1,17 @@
 """`roverflow fleet` and `roverflow list`: many logs, each once, with the bits of `roverflow run`."""
 
 import json
+import os
+import signal
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from distributed import Client
 
 from flow.cli.fleet.catalogue import Catalogue
-from flow.cli.fleet.engine import Fleet
+from flow.cli.fleet.engine import Fleet, cluster
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
 from flow.cli.fleet.progress import Progress
 from flow.cli.fleet.task import Pipeline, Task, run_task, unfit
@@ -174,6 +178,31 @@ def test_a_worker_that_stays_forgets_the_stages_of_an_earlier_fleet(logs, tmp_pa
         files = {"own.yaml": text, "travelled_trap.py": code.encode()}
         assert unfit(replace(task, pipeline=Pipeline("own.yaml", files, ()))).startswith(refused)
         assert bool(unfit(replace(task, pipeline=Pipeline("own.yaml", files, ())))) == bool(refused)
+
+
+def cores_of_workers(client: Client) -> list[set[int]]:
+    """The cores of the threads in which two workers run their logs."""
+    client.wait_for_workers(2)
+    futures = [client.submit(os.sched_getaffinity, 0, workers=[worker], pure=False) for worker in client.nthreads()]
+    return client.gather(futures)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    len(getattr(os, "sched_getaffinity", lambda _: ())(0)) < 2, reason="needs two cores that can be chosen"
+)
+def test_worker_processes_have_cores_of_their_own_also_after_a_death():
+    with cluster(None, 2, cores=1, memory="2GB", dashboard=False) as client:
+        first, second = cores_of_workers(client)
+        assert (len(first), len(second), len(first | second)) == (1, 1, 2)
+        before = set(client.run(os.getpid).values())
+        os.kill(min(before), signal.SIGKILL)
+        while len(before | set(client.run(os.getpid, on_error="ignore").values())) < 3:
+            time.sleep(0.1)
+        assert set.union(*cores_of_workers(client)) == first | second
+    many = len(os.sched_getaffinity(0))
+    with cluster(None, 2, cores=many, memory="2GB", dashboard=False) as client:
+        assert {len(cores) for cores in cores_of_workers(client)} == {many}
 
 
 def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -69,6 +68,7 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
     from flow.cli.fleet.jobs import reason_to_run
     from flow.cli.fleet.progress import Progress
     from flow.cli.replay import product_version
+    from flow.runtime.bottleneck import usable_cores
 
     folder = catalogue.path.parent
     rows = {row["name"]: row for row in catalogue.rows()}
@@ -82,9 +82,11 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
     if not due:
         return
     tasks = tasks_of(due, folder, pipeline, options.rrd, options.workers_per_log)
-    processes = options.processes or max(1, (os.cpu_count() or 1) // options.workers_per_log)
+    processes = options.processes or max(1, usable_cores() // options.workers_per_log)
     with (
-        cluster(options.cluster, min(processes, len(due)), options.memory, options.dashboard) as client,
+        cluster(
+            options.cluster, min(processes, len(due)), options.workers_per_log, options.memory, options.dashboard
+        ) as client,
         Progress({job.name: job.size for job in due}) as progress,
     ):
         Fleet(folder, catalogue, tasks, progress, stall_seconds=options.stall).run(client)

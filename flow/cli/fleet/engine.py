@@ -171,8 +171,10 @@ def _waiting(job: Job, task: Task) -> dict[str, Any]:
 
 
 @contextmanager
-def cluster(address: str | None, processes: int, memory: str, dashboard: bool) -> Iterator[Any]:
+def cluster(address: str | None, processes: int, cores: int, memory: str, dashboard: bool) -> Iterator[Any]:
     """A client of the Dask cluster at `address`, or of worker processes of this machine that end with it.
+
+    cores: of each process, to which it is bound.
 
     Raises
     ------
@@ -182,6 +184,8 @@ def cluster(address: str | None, processes: int, memory: str, dashboard: bool) -
     try:
         import dask
         from distributed import Client, LocalCluster
+
+        from flow.cli.fleet.binding import CoreBinding
     except ImportError as error:
         raise UsageError("a fleet needs dask.distributed; install roverflow[fleet]") from error
     for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
@@ -213,6 +217,7 @@ def cluster(address: str | None, processes: int, memory: str, dashboard: bool) -
     except ValueError as error:
         raise UsageError(f"the worker processes cannot start: {error}") from error
     with local, Client(local) as client:
+        client.register_plugin(CoreBinding(processes, cores))
         yield client
 
 
