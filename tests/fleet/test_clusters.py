@@ -153,6 +153,18 @@ def test_a_client_that_is_killed_is_continued_by_the_same_command(home, tmp_path
 
 
 @pytest.mark.slow
+def test_an_interrupted_fleet_ends_its_workers(home, tmp_path):
+    fleet = until(command(home, tmp_path / "out", "--processes", 2), "1 of 12")
+    workers = psutil.Process(fleet.pid).children(recursive=True)
+    fleet.send_signal(signal.SIGINT)
+    said = fleet.communicate(timeout=LIMIT)[1]
+    assert "roverflow: interrupted\n" in said
+    assert "resource_tracker" not in said
+    assert fleet.returncode == 130
+    assert not psutil.wait_procs(workers, timeout=LIMIT)[1]
+
+
+@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_named(home, tmp_path, capsys):
     words = ("fleet", home / "log00.mcap", "--out", tmp_path / "out", *PIPELINE, "--cluster", "tcp://127.0.0.1:1")
     assert roverflow(*words) == 2

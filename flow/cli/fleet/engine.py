@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -210,6 +211,8 @@ def cluster(address: str | None, processes: int, cores: int, memory: str, dashbo
         with client:
             yield client
         return
+    # Of workers that an interrupt ends, which own semaphores.
+    os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
     settings = {"n_workers": processes, "threads_per_worker": 1, "processes": True, "memory_limit": memory}
     shown = {"dashboard_address": f"127.0.0.1:{8787 if dashboard else 0}", "scheduler_kwargs": {"dashboard": dashboard}}
     try:
