@@ -69,10 +69,14 @@ def estimated(samples, **parameters):
     return [*tilts, *estimator.finish()], estimator
 
 
-def rms_of_estimate(simulation):
-    """RMS of the angles, deg, between the estimate and the truth, from the first frame of a simulated drive on."""
+def errors_of_estimate(simulation, accelerometer_bias=0.03):
+    """RMS of the angles, deg, between the estimate and the truth, from the first frame of a simulated drive on; and of
+    those about each horizontal axis over their stated sigmas."""
     stamps, found = simulation.sensor_stamps(simulation.imu_rate), simulation.inertial
     up = np.array([simulation.base_at(stamp).after(simulation.mounts[2]).rotation[2] for stamp in stamps])
     driven = Drive(np.array(stamps), found.rates, found.accelerations, up)
-    tilts, _ = estimated(driven.samples())
-    return float(np.sqrt(np.mean(driven.errors([tilt for tilt in tilts if tilt.stamp >= simulation.start]) ** 2)))
+    tilts, _ = estimated(driven.samples(), accelerometer_bias=accelerometer_bias)
+    tilts = [tilt for tilt in tilts if tilt.stamp >= simulation.start]
+    errors = driven.errors(tilts)
+    judged = errors / np.sqrt(2) / np.degrees([tilt.sigma for tilt in tilts])
+    return tuple(float(np.sqrt(np.mean(values**2))) for values in (errors, judged))
