@@ -100,6 +100,8 @@ def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_p
     output = capsys.readouterr().out
     assert "2 frames from 0.534 s on: " in output
     assert "\nnote: 1 frame gave no result; roverflow run --start " in output
+    assert roverflow("try", log, "--at", "1.05", "-p", "fast", *SMALL, "-o", tmp_path / "c") == 2
+    assert "no frame went through at 1.034 s: left unmatched; roverflow run --start " in capsys.readouterr().err
 
 
 def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, capsys):
@@ -114,6 +116,7 @@ def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, capsys)
     [
         (("--at", "99", *SMALL), "--at 99 is outside the images of the log"),
         (("--at", "0", *SMALL, "--set", "source.left=/nix"), "a change of the source needs a run of its own"),
+        (("--at", "0", "--set", "stereo.slop=9 ms"), "a change of 'stereo', which makes the frames, needs a run of"),
         (
             ("--at", "0", *SMALL, *SMALL, *SMALL[:1], "a=1", *SMALL[:1], "a=2"),
             "only one setting may have several values",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flow.cli.instants import Instant, part_of
+from flow.cli.instants import Instant, no_frame, part_of
 from flow.cli.replay import one_thread_per_call
 from flow.cli.report import say
 from flow.cli.result_input import graph_of, input_of
@@ -226,9 +226,9 @@ def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
         if part.note:
             say(f"note: {part.note}")
         log.narrow(part.start, part.end)
-        run(replace(graph, sinks=(("keep", kept),)), log, {"keep": Path("memory")})
+        summary = run(replace(graph, sinks=(("keep", kept),)), log, {"keep": Path("memory")})
     if not kept.records:
-        raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.start:.3f} says why")
+        raise no_frame(part, summary)
     return kept.records[0].items
 
 

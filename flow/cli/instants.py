@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.contracts import LossReason
 from flow.errors import UsageError
 from recordings.containers.container import RawMessage
 
@@ -57,6 +59,18 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     beyond = (chosen == 0 and off < -half) or (chosen == times.size - 1 and off > half)
     note = f"{_outside(log, times, at)}; the {'last' if off > 0 else 'first'} one is taken" if beyond else ""
     return Part(start, end, (time - log.begin) / 1e9, high - chosen + 1, chosen - low, stamp, first, note)
+
+
+def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
+    """That a run over a part, whose summary is given, has no frame: with the losses at its stamp.
+
+    Why a partner did not come is not said: the part ends before it could.
+    """
+    lost = [entry for entry in summary["ledger"] if entry["stamp"] == part.stamp]
+    details = ("" if entry["reason"] == LossReason.UNMATCHED else f" ({entry['detail']})" for entry in lost)
+    losses = [f": {entry['stream']} {entry['reason']}{detail}" for entry, detail in zip(lost, details, strict=True)]
+    begin = f"roverflow run --start {part.first:.3f} says why"
+    return UsageError(f"no frame went through at {part.at:.3f} s{''.join(losses[:1])}; {begin}")
 
 
 def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:

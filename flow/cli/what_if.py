@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flow.cli.instants import Instant, Part, part_of
+from flow.cli.instants import Instant, Part, no_frame, part_of
 from flow.cli.logged_state import resume
 from flow.cli.replay import ARROW_EXTRA, RESULT_TYPES, one_thread_per_call, product_version
 from flow.cli.result_input import graph_of
@@ -93,11 +93,11 @@ def run_variants(
         }  # fmt: skip
         sinks = tuple((label, _sink(graphs[label], variants, label, (changes[label], part.stamp))) for label in graphs)
         paths = {label: folder / f"{label}.mcap" for label in graphs}
-        run(replace(variants.graph, sinks=sinks), log, paths, workers=workers, about=about, states=states)
-    missing = [label for label, path in paths.items() if not path.exists()]
-    if missing:
-        raise UsageError(f"no frame went through at {part.at:.3f} s; roverflow run --start {part.first:.3f} says why")
-    frames = stamps_of(paths["A"], results=True).size
+        ran = replace(variants.graph, sinks=sinks)
+        summary = run(ran, log, paths, workers=workers, about=about, states=states)
+    frames = stamps_of(paths["A"], results=True).size if all(path.exists() for path in paths.values()) else 0
+    if not frames:
+        raise no_frame(part, summary)
     if frames < part.frames:
         says_why = f"roverflow run --start {part.first:.3f} --end {part.end:.3f} says why"
         notes.append(f"note: {counted(part.frames - frames, 'frame')} gave no result; {says_why}")

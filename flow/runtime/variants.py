@@ -33,7 +33,7 @@ def merged(variants: Mapping[str, Graph]) -> Variants:
     Raises
     ------
     UsageError
-        If the variants have different sources, whose messages cannot be shared.
+        If the variants have different sources, whose messages cannot be shared, or pair the images differently.
     """
     (_, first), *_ = variants.items()
     nodes, names, own = dict[str, Node](), dict[str, dict[str, str]](), dict[str, tuple[str, ...]]()
@@ -52,6 +52,9 @@ def merged(variants: Mapping[str, Graph]) -> Variants:
                 nodes[name] = replace(node, name=name, inputs=inputs, clock=clock)
                 kinds[name] = graph.kinds[node.name]
             mine[node.name] = makers[maker]
+        if mine.get(graph.clock, graph.clock) != first.clock:
+            needs = "needs a run of its own; run both pipelines and use roverflow diff"
+            raise UsageError(f"a change of '{graph.clock}', which makes the frames, {needs}")
         own[label] = tuple(name for name, stream in mine.items() if stream.endswith(f"@{label}"))
     return Variants(replace(first, nodes=tuple(nodes.values()), sinks=(), kinds=kinds), names, own)
 
