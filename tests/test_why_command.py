@@ -111,6 +111,22 @@ def test_what_cannot_be_explained_is_refused(traverse, fast_result, capsys):
     assert "the pipeline has no navigation map 'nix', only navigation_map, regional_navigation_map" in other
 
 
+def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result, stamp, capsys):
+    grid = messages(fast_result, "/nav/navigation_map")[stamp]
+    terrain = read_grid_map(messages(fast_result, "/nav/elevation_map")[stamp])
+    unsure = read_occupancy_grid(grid, messages(fast_result, "/nav/navigation_map/reason")[stamp]).reason == 9
+    for few, cells in ((True, terrain.layers["count"] < 1), (False, terrain.layers["count"] >= 1)):
+        row, col = np.argwhere(unsure & cells)[0]
+        x, y = (terrain.origin[axis] + (place + 0.5) * terrain.resolution for axis, place in ((0, col), (1, row)))
+        assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse) == 0
+        output = capsys.readouterr().out
+        (because,) = re.findall(r"\nnot free because: (.+)\n", output)
+        assert "unknown, reason unsure\n" in output
+        assert ("fewer points than min_points" in because) == few
+    (x, y), *_ = places(fast_result, stamp, Cell.FREE, 1)
+    assert not why(fast_result, AT, cell=(x, y), log=traverse).doubts
+
+
 def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, capsys):
     grid = read_occupancy_grid(messages(fast_result, "/nav/navigation_map")[stamp])
     x, y = (start + 0.5 * grid.resolution for start in grid.origin)

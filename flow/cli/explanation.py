@@ -36,7 +36,7 @@ from stages.data import (
     StereoFrame,
     Tilt,
 )
-from stages.terrain.verdict_limits import Limit, Turn, limits_at, turns_at
+from stages.terrain.verdict_limits import Limit, Turn, doubts_at, limits_at, turns_at
 
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
@@ -64,6 +64,8 @@ class CellExplanation:
         Layer of the elevation map -> its value in the cell; NaN is unknown.
     limits : dict
         Quantity -> `Limit`: the rule compares its value with its limit.
+    doubts : list of str
+        Of a cell that is UNSURE: why it is not free, though it exceeds no limit.
     turns : list of Turn
         The smallest change of each parameter that would turn the verdict.
     """
@@ -76,6 +78,7 @@ class CellExplanation:
     reason: CellReason
     layers: Mapping[str, float]
     limits: Mapping[str, Limit]
+    doubts: list[str]
     turns: list[Turn]
 
 
@@ -193,11 +196,13 @@ def verdict_at(
 ) -> dict[str, Any]:
     """The fields of `CellExplanation` of a cell, by row and column."""
     x, y = centre_of(navigation, place)
+    reason = CellReason(int(navigation.reason[place]))
     return {
         "stamp": navigation.stamp, "x": round(x, 6), "y": round(y, 6),
-        "verdict": Cell(int(navigation.cells[place])), "reason": CellReason(int(navigation.reason[place])),
+        "verdict": Cell(int(navigation.cells[place])), "reason": reason,
         "layers": {name: float(layer[place]) for name, layer in terrain.layers.items()},
         "limits": limits_at(rule, terrain, *place), "turns": turns_at(rule, terrain, *place),
+        "doubts": doubts_at(rule, terrain, *place) if reason == CellReason.UNSURE else [],
     }  # fmt: skip
 
 

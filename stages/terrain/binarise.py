@@ -106,25 +106,45 @@ class Binarise(Stage):
             raise StageError(
                 f"Binarise: the map has no layer '{missing[0]}'; put stages.TerrainFeatures before stages.Binarise"
             )
-        ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
-        above = elevation.layers["elevation"] - ground
-        high = observed & (step >= self.rover.max_step - self.height_margin)
-        belly = observed & (above >= self.rover.ground_clearance - self.height_margin)
+        slope, steepness, roughness = (elevation.layers[name] for name in ("slope", "steepness", "roughness"))
+        high, belly = self._obstacles(elevation, observed)
         limit = self.rover.max_slope + _SLOPE_ROUNDING
-
-        known = np.isfinite(slope) & np.isfinite(roughness) & (support >= MIN_SUPPORT)
-        if "variance" in elevation.layers:
-            known &= elevation.layers["variance"] <= self.max_sigma**2
-        known &= steepness + self.steepness_error * (steepness - slope) <= limit
-        known &= ~self._cut(elevation, observed, above, step)
-        known &= ~self._brink(elevation) & ~_dilated(high | belly, RIM / elevation.resolution)
-        reason = np.where(known, CellReason.CLEAR, CellReason.UNSURE)
+        unsure = np.logical_or.reduce([*self.doubts(elevation).values()])
+        reason = np.where(unsure, CellReason.UNSURE, CellReason.CLEAR)
         reason[_dilated(high | belly, self.hazard_margin / elevation.resolution)] = CellReason.BESIDE
         reason[roughness > self.max_roughness] = CellReason.ROUGHNESS
         reason[(slope > limit) | (steepness > limit)] = CellReason.SLOPE
         reason[belly] = CellReason.CLEARANCE
         reason[high] = CellReason.STEP
         return reason
+
+    def _obstacles(self, elevation: ElevationMap, observed: Array) -> tuple[Array, Array]:
+        """Cells (rows, cols) bool too high for a wheel, and for the rover's belly."""
+        above = elevation.layers["elevation"] - elevation.layers["ground"]
+        high = observed & (elevation.layers["step"] >= self.rover.max_step - self.height_margin)
+        return high, observed & (above >= self.rover.ground_clearance - self.height_margin)
+
+    def doubts(self, elevation: ElevationMap) -> dict[str, Array]:
+        """Doubt, in words -> cells (rows, cols) bool that method "rover" does not call free because of it."""
+        ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
+        observed, above = np.isfinite(elevation.layers["elevation"]), elevation.layers["elevation"] - ground
+        obstacle = np.logical_or(*self._obstacles(elevation, observed))
+        limit = self.rover.max_slope + _SLOPE_ROUNDING
+        found = {
+            "no slope or roughness": ~(np.isfinite(slope) & np.isfinite(roughness)),
+            f"support below {MIN_SUPPORT:g}": ~(support >= MIN_SUPPORT),
+            "possibly too steep (steepness_error)": ~(
+                steepness + self.steepness_error * (steepness - slope) <= limit
+            ),
+            "on an obstacle that the edge of view cuts (min_rise)": self._cut(elevation, observed, above, step),
+            "at a brink (min_drop)": self._brink(elevation),
+            f"within {RIM:g} m of an obstacle": _dilated(obstacle, RIM / elevation.resolution),
+        }
+        if "variance" in elevation.layers:
+            found["sigma above max_sigma"] = ~(elevation.layers["variance"] <= self.max_sigma**2)
+        if "count" in elevation.layers:
+            found["fewer points than min_points"] = elevation.layers["count"] < self.min_points
+        return found
 
     def _cut(self, elevation: ElevationMap, observed: Array, above: Array, step: Array) -> Array:
         """Cells (rows, cols) bool of obstacles that the edge of view may cut, and those within half a wheel of the cut.

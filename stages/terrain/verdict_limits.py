@@ -56,6 +56,14 @@ def limits_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> dict
     return found
 
 
+def doubts_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[str]:
+    """In words, all that keeps the rule from calling a cell without a hazard free."""
+    if rule.method == "absolute" or math.isnan(terrain.layers["elevation"][row, col]):
+        return []
+    part, row, col = _around(terrain, row, col)
+    return [doubt for doubt, cells in rule.doubts(part).items() if cells[row, col]]
+
+
 def limits_of(rule: Binarise) -> dict[str, float]:
     """Layer of an elevation map -> the value above which a cell is a hazard or unsure; slopes in degrees."""
     if rule.method == "absolute":

@@ -114,6 +114,7 @@ def _cell_lines(found: Explanation | RegionalExplanation) -> list[str]:
     else:
         lines.append("limits:")
         lines += [f"  {name:<24} {_against(name, limit)}" for name, limit in found.limits.items()]
+    lines += [f"not free because: {'; '.join(found.doubts)}"] if found.doubts else []
     turns = [f"{turn.verdict.name.lower()} with {_change(found.stream, turn)}" for turn in found.turns[:MAX_TURNS]]
     return [*lines, *(turns or ["no single parameter of the hazard rule turns the verdict"])]
 
@@ -125,7 +126,8 @@ def _pixel_lines(found: Explanation) -> list[str]:
     width = found.image.shape[1] if found.image.size else 1
     rows, cols = divmod(found.pixels, width)
     sources = ", ".join(f"{number} {name.lower()}" for name, number in found.sources.items())
-    sigma = f", sigma {float(sorted(found.sigmas)[len(found.sigmas) // 2]):.2f} px" if found.sigmas.size else ""
+    sigmas = sorted(value for value in found.sigmas.tolist() if math.isfinite(value))  # only measured pixels have one
+    sigma = f", sigma {sigmas[len(sigmas) // 2]:.2f} px" if sigmas else ""
     extent = f"columns {cols.min()} to {cols.max()}, rows {rows.min()} to {rows.max()}"
     low, high = found.disparities.min(), found.disparities.max()
     return [
