@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy_grid
-from recordings.scoring.metrics import angle_between
 from stages.data import Array, Cell, NavigationMap
 
 Measures = dict[str, float]
@@ -70,7 +69,11 @@ def cells(one: NavigationMap, other: NavigationMap) -> tuple[Array, Array]:
 
 
 def _disparities(one: Any, other: Any) -> Measures:
-    return _changes(read_disparity(one), read_disparity(other), "pixels", "px", 1.0)
+    found = _changes(read_disparity(one), read_disparity(other), "pixels", "px", 1.0)
+    return found | {
+        "largest difference of the baselines mm": 1e3 * float(np.nan_to_num(abs(other.t - one.t))),
+        "largest difference of the focal lengths px": float(np.nan_to_num(abs(other.f - one.f))),
+    }
 
 
 def _maps(one: Any, other: Any) -> Measures:
@@ -108,15 +111,33 @@ def _codes(one: Any, other: Any) -> Measures:
 
 def _poses(one: Any, other: Any) -> Measures:
     first, second = one.pose.pose, other.pose.pose
-    places = [np.array([pose.position.x, pose.position.y, pose.position.z]) for pose in (first, second)]
-    turns = [np.array([q.x, q.y, q.z, q.w]) for q in (first.orientation, second.orientation)]
-    angle = 2.0 * angle_between(turns[0], turns[1] * np.sign(turns[0] @ turns[1] or 1.0))
+    return _moved((first.position, first.orientation), (second.position, second.orientation))
+
+
+def _transforms(one: Any, other: Any) -> Measures:
+    first, second = (
+        {(item.header.frame_id, item.child_frame_id): item.transform for item in message.transforms}
+        for message in (one, other)
+    )
+    found = {f"transforms only in {name}": float(len(own.keys() - them.keys()))
+             for name, own, them in (("A", first, second), ("B", second, first))}  # fmt: skip
+    for frames in first.keys() & second.keys():
+        moved = _moved(*((each.translation, each.rotation) for each in (first[frames], second[frames])))
+        found |= {name: max(value, found.get(name, 0.0)) for name, value in moved.items()}
+    return found
+
+
+def _moved(one: tuple[Any, Any], other: tuple[Any, Any]) -> Measures:
+    """How far apart two places are, each a position and a quaternion."""
+    places = [np.array([at.x, at.y, at.z]) for at, _ in (one, other)]
+    turn, to = (np.array([q.x, q.y, q.z, q.w]) for _, q in (one, other))
+    near, far = sorted([np.linalg.norm(turn - to), np.linalg.norm(turn + to)])  # q and -q are the same turn
     distance = float(np.linalg.norm(places[1] - places[0]))
-    return {"largest position mm": 1e3 * distance, "largest angle deg": float(np.degrees(angle))}
+    return {"largest position mm": 1e3 * distance, "largest angle deg": float(np.degrees(4 * np.arctan2(near, far)))}
 
 
 def _points(one: Any, other: Any) -> Measures:
-    return {"points": float(abs(one.width * one.height - other.width * other.height))}
+    return {"points more or fewer": float(abs(one.width * one.height - other.width * other.height))}
 
 
 def _differ(one: Array, other: Array) -> Array:
@@ -146,4 +167,5 @@ _MEASURES: Mapping[str, Callable[[Any, Any], Measures]] = {
     "sensor_msgs/msg/Image": _codes,
     "nav_msgs/msg/Odometry": _poses,
     "sensor_msgs/msg/PointCloud2": _points,
+    "tf2_msgs/msg/TFMessage": _transforms,
 }

@@ -222,7 +222,7 @@ class _Tally:
             )
         if given is not None and not _same_camera(given, frame["/truth/disparity"]):
             why = f"its camera has {_lens(given)}, the truth's has {_lens(frame['/truth/disparity'])}"
-            self._leave_out("/nav/disparity", f"{why}: they are not of the same image")
+            self._leave_out("/nav/disparity", f"{why}: another image, or a wrong calibration")
             return {}
         columns = cropped_columns(frame["/truth/disparity"].max_disparity)
         occlusion, codes = (
