@@ -65,7 +65,7 @@ def import_arrays() -> None:
 
 def imported_kernels() -> list[Any]:
     """The kernels in all modules of stages that are imported, each once, in the order of the pipeline's stages."""
-    modules = [module for name, module in list(sys.modules.items()) if name.startswith("stages.")]
+    modules = [module for name, module in sys.modules.copy().items() if name.startswith("stages.")]
     values = [value for module in modules for value in vars(module).values()]
     return list({id(value): value for value in values if isinstance(value, Dispatcher)}.values())
 
