@@ -31,15 +31,20 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def cluster(port: int) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Address and scheduler of `dask scheduler` and two `dask worker`, started by their own commands."""
+def cluster(port: int, modules: Path | None = None) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Address and scheduler of `dask scheduler` and two `dask worker`, started by their own commands.
+
+    modules: a folder that all import first.
+    """
     address = f"tcp://127.0.0.1:{port}"
     scheduler = ("scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard")
     worker = ("worker", address, "--nthreads", 1, "--host", "127.0.0.1", "--no-dashboard")
-    started = []
+    started, environment = [], ENVIRONMENT
+    if modules:
+        environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join((str(modules), ENVIRONMENT["PYTHONPATH"]))}
     for words in (scheduler, worker, worker):
         command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *map(str, words[1:])]
-        started.append(subprocess.Popen(command, stderr=subprocess.DEVNULL, env=ENVIRONMENT))
+        started.append(subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment))
     try:
         with Client(address, timeout=LIMIT) as client:
             client.wait_for_workers(2, timeout=LIMIT)
@@ -165,6 +170,19 @@ def test_an_interrupted_fleet_ends_its_workers(home, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.slow
+@pytest.mark.parametrize("package", ["roverflow", "numpy"])
+def test_workers_of_another_version_are_refused(home, tmp_path, capsys, package):
+    about = tmp_path / "modules" / f"{package}-99.0.dist-info" / "METADATA"
+    about.parent.mkdir(parents=True)
+    about.write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 99.0\n")
+    with cluster(18796, tmp_path / "modules") as (address, _):
+        code = roverflow("fleet", home, "--out", tmp_path / "out", *PIPELINE, "--cluster", address)
+    name = "version" if package == "roverflow" else package
+    assert (code, f"has another {name} (99.0) than this machine" in capsys.readouterr().err) == (2, True)
+    assert not list((tmp_path / "out").glob("*-nav.mcap"))
+
+
 def test_a_scheduler_that_is_not_there_is_named(home, tmp_path, capsys):
     words = ("fleet", home / "log00.mcap", "--out", tmp_path / "out", *PIPELINE, "--cluster", "tcp://127.0.0.1:1")
     assert roverflow(*words) == 2
