@@ -27,7 +27,7 @@ LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "secon
 LAYOUT = "layout"  # the text from which other desks are made
 CURVES = "curves"  # the names of the curves of a panel, which stand beside the plot
 SLOWEST = f"{LAYOUT}/slowest"  # those of the slowest stages, which differ from run to run
-LEDGER_CHARS = 80  # of a line of the ledger, which the viewer does not wrap
+LEDGER_CHARS = 80  # of a line of a text log, which the viewer does not wrap
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
 SHOWN_LAYERS = (
     "step",
@@ -141,11 +141,13 @@ def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
 
 
 def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
-    """The maps, their reasons and layers, and the surface."""
-    layers = _flat_views(drawn, Panel.LAYER)
+    """The maps, their reasons and layers, and the surface; what made a regional map is behind its reasons."""
+    layers = _flat_views(tuple(spec for spec in drawn if spec.frame_id == LEVEL_FRAME), Panel.LAYER)
+    regional = _flat_views(tuple(spec for spec in drawn if spec.frame_id != LEVEL_FRAME), Panel.LAYER)
     shown = [view for view in layers if view.name in SHOWN_LAYERS]
     flat = [
-        *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.RELIEF, Panel.MAP, Panel.REASON)), *shown,
+        *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.RELIEF, Panel.MAP)),
+        _tabs([*_flat_views(drawn, Panel.REASON), *regional]), *shown,
         _tabs(view for view in layers if view not in shown),
     ]  # fmt: skip
     return _row((_grid(flat, 3), 5.0), (_space(drawn), 3.0)) or _ledger(drawn)
@@ -162,7 +164,10 @@ def _tilt(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """The readings, their residuals in the images, and the cloud that is levelled by them."""
     plots = [_panel(drawn, panel, title, in_tab=False) for panel, title in SENSOR_PLOTS]
     space = _stack([*_image_tabs(drawn)[:1], _tabs(_spaces(drawn, Panel.CLOUD, "cloud")), _tabs(_trajectories(drawn))])
-    return _row((space, 2.0), (_stack([*plots[:2], plots[3], _ledger(drawn)]), 3.0)) or _ledger(drawn)
+    rows = [(plots[0], 3.0), (plots[1], 4.0), (plots[3], 2.0), (_ledger(drawn), 3.0)]  # the check's angles are small
+    present = [(part, share) for part, share in rows if part is not None]
+    right = rrb.Vertical(*(part for part, _ in present), row_shares=[share for _, share in present])
+    return _row((space, 2.0), (right, 3.0)) or _ledger(drawn)
 
 
 DESKS: dict[str, Callable[[Specs, Sequence[str]], _Part]] = {

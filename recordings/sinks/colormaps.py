@@ -146,6 +146,13 @@ def gray_difference(left: Array, right: Array, disparity: Array, max_width: int)
     return np.where(seen, np.abs(fitted), np.float32(np.nan))
 
 
+def provenance(terrain: ElevationMap) -> dict[str, Array]:
+    """Of a fused map: in how many frames each of its cells was seen, and contradicted. Of others: nothing."""
+    layers = terrain.layers
+    names = ("frames", "contradictions") if "frames" in layers else ()
+    return {name: np.where(layers["frames"] > 0, layers[name], np.float32(np.nan)) for name in names}
+
+
 def every_nth_cell(terrain: ElevationMap, max_cells: int) -> ElevationMap:
     """The terrain at every n-th row and column, with about `max_cells` known elevations at most."""
     elevation = terrain.layers["elevation"]

@@ -42,7 +42,7 @@ ALL_CODES = np.arange(256, dtype=np.uint8)
 # Layer -> the upper end of its scale, twice the usual limit, and its unit
 LAYER_SCALES = {
     "step": (0.4, "m"), "slope": (40.0, "deg"), "steepness": (40.0, "deg"), "roughness": (0.12, "m"),
-    "variance": (0.009, "m²"),
+    "variance": (0.009, "m²"), "frames": (20.0, "frames"), "contradictions": (4.0, "frames"),
 }  # fmt: skip
 DIFFERENCE_STEPS = 0.25  # the difference of the images is drawn to 4 gray levels
 MAX_DIFFERENCE = 32  # gray levels, the upper end of the scale of the images' difference
@@ -244,7 +244,7 @@ def log_health(canvas: Canvas, stream: str, health: TiltHealth) -> str:
 def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     """Shaded relief, the surface in 3-D, and every layer of a frame's own map (hover reads the values).
 
-    The layers of a regional map are in the result log only.
+    Of a regional map only the layers that say which frames it is made of are drawn; the result log has all.
     """
     terrain = colormaps.terrain_ahead(terrain)
     elevation, suffix = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
@@ -258,8 +258,10 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     if not canvas.pictures:
         return caption
     coarse = colormaps.every_nth_cell(terrain, MAX_CELLS)
-    for name, layer in coarse.layers.items() if terrain.frame_id == LEVEL_FRAME else ():
-        view = ViewSpec(Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", f"{name}{suffix}")
+    layers = coarse.layers if terrain.frame_id == LEVEL_FRAME else colormaps.provenance(coarse)
+    for name, layer in layers.items():
+        part = f"layers/{rr.escape_entity_path_part(name)}"
+        view = ViewSpec(Panel.LAYER, stream, part, f"{name}{suffix}", terrain.frame_id)
         picture = colormaps.birds_eye(layer)
         end, unit = LAYER_SCALES.get(name, (0.0, ""))
         scale = float(np.degrees(1.0)) if unit == "deg" else 1.0

@@ -123,7 +123,8 @@ class RerunRecording:
             self._plot(record)
             self._canvas.clear_missing()
             text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
-            self._recording.log(FRAMES, rr.TextLog(text, level=rr.TextLogLevel.INFO))
+            for line in lines_of(text):
+                self._recording.log(FRAMES, rr.TextLog(line, level=rr.TextLogLevel.INFO))
             self._log_losses(record.entries, self._frames)
             self._send_blueprint()
             if self._viewer is not None:

@@ -89,6 +89,13 @@ def test_the_desk_of_matching_shows_the_images_and_what_is_known_of_errors(rrd):
     }  # fmt: skip
 
 
+def test_the_desk_of_terrain_has_the_frames_of_a_regional_map_behind_its_reasons(rrd):
+    regional = [ViewSpec(Panel.LAYER, "regional_map", "layers/frames", "frames (odom)", "odom")]
+    names = [view.name for view in views(container([*read_layout(rrd).views, *regional], "terrain"))]
+    assert names[names.index("reason") + 1] == "frames (odom)"
+    assert names.index("frames (odom)") < names.index("slope") < names.index("elevation")
+
+
 def view_paths(view: Any) -> list[str]:
     """The entities that a view shows."""
     if view.contents == "$origin/**" or not isinstance(view.contents, list):

@@ -139,8 +139,10 @@ def test_losses_are_logged_at_their_own_stamps(tmp_path):
     path = record_of(tmp_path / "ledger.rrd", [Record(START, scene(), (lost,))], summary)
     texts = {clock: value[0] for clock, _, value in rows(path, "/ledger", "TextLog:text")}
     assert texts[START - 7] == "tilt lost tilt: unaligned. no message within 200 ms"
-    captions = {clock: value[0] for clock, _, value in rows(path, "/frames", "TextLog:text")}
-    assert captions[START].startswith("0.75 s of work; matched 92 % known")
+    captions = [(clock, value[0]) for clock, _, value in rows(path, "/frames", "TextLog:text")]
+    assert captions[0][0] == START
+    assert captions[0][1].startswith("0.75 s of work; matched 92 % known")
+    assert max(len(line) for _, line in captions) <= 80 < sum(len(line) for _, line in captions)
     last = [value[0] for *_, value in rows(path, "/ledger", "TextLog:text")][-2:]
     assert set(last) == {
         "left lost right: unmatched. no partner within 5 ms", "INCOMPLETE: 1 frame, 1 unaligned, 1 unmatched",

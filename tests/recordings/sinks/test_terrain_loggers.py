@@ -96,3 +96,17 @@ def test_every_reason_has_a_colour_of_its_own():
 def test_every_pixel_origin_has_a_colour_of_its_own():
     assert set(SOURCE_LEGEND) == set(PixelOrigin)
     assert len({colour for _, colour in SOURCE_LEGEND.values()}) == len(SOURCE_LEGEND)
+
+
+def test_a_regional_map_shows_which_frames_it_is_made_of(tmp_path):
+    terrain = replace(scene()["elevation_map"], frame_id="odom")
+    frames = np.where(np.isfinite(terrain.layers["elevation"]), np.float32(3), np.float32(0))
+    layers = terrain.layers | {"frames": frames, "contradictions": frames / 3}
+    path = record_of(tmp_path / "a.rrd", [Record(START, {"elevation_map": replace(terrain, layers=layers)})])
+    drawn = {entity for entity in entities(path) if "/layers/" in entity and "/scale" not in entity}
+    assert drawn == {"/elevation_map/layers/frames", "/elevation_map/layers/contradictions"}
+    buffer = np.array(rows(path, "/elevation_map/layers/frames", "DepthImage:buffer")[0][2][0], np.uint8)
+    values = buffer.view(np.float16)
+    assert set(values[np.isfinite(values)]) == {3}
+    assert 0 < np.isnan(values).mean() < 1
+    assert rows(path, "/elevation_map/layers/frames/scale/text", "Points2D:labels")[0][2][2] == "20 frames"
