@@ -30,7 +30,7 @@ ROWS = (
 )
 
 
-SCORES = ("log", "density", "bad-0.5", "bad-1", "RMS px", "height cm", "missed", "false alarm")  # of `brief_row`
+SCORES = ("log", "density", "bad-0.5", "bad-1", "RMS px", "height cm", "missed", "false alarm", "unknown")
 
 
 def format_score(found: Score) -> str:
@@ -74,14 +74,14 @@ def brief_figures(found: Score) -> list[float]:
     return [
         *stereo,
         height,
-        *(ground["hazards"][name] if ground else math.nan for name in ("false_safe", "false_alarm")),
+        *(ground["hazards"][name] if ground else math.nan for name in ("false_safe", "false_alarm", "unknown")),
     ]
 
 
 def brief_row(name: str, values: Sequence[float]) -> tuple[str, ...]:
     """One row of `SCORES` as text."""
-    density, half, one, rms, height, missed, alarms = values
-    shares = [f"{100 * value:.2f} %" for value in (density, half, one, missed, alarms)]
+    density, half, one, rms, height, *cells = values
+    shares = [f"{100 * value:.2f} %" for value in (density, half, one, *cells)]
     return (name, *shares[:3], f"{rms:.3f}", f"{100 * height:.2f}", *shares[3:])
 
 

@@ -18,7 +18,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.scoring import score as scoring
 from recordings.scoring.stereo_metrics import SURFACES
-from recordings.scoring.table import ROWS, format_brief, format_score, terrain_lines
+from recordings.scoring.table import ROWS, SCORES, brief_figures, brief_row, format_brief, format_score, terrain_lines
 from recordings.simulator import Simulation, ground_truth, write_log
 from recordings.simulator.texture import TerrainClass
 from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
@@ -232,10 +232,13 @@ def test_a_map_that_is_all_free_detects_no_rock(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain
     assert found["hazards"]["recall"] == found["rocks"]["0.2 m"]["detected"] == 0
     assert found["hazards"]["false_safe"] == 1
-    blind = scored(tmp_path, truth, frames, cells=lambda cells: np.full_like(cells, Cell.UNKNOWN)).terrain
+    nothing = scored(tmp_path, truth, frames, cells=lambda cells: np.full_like(cells, Cell.UNKNOWN))
+    blind = nothing.terrain
     assert blind["hazards"]["unknown"] == 1
     assert blind["hazards"]["false_safe"] == 0
     assert blind["rocks"]["0.2 m"]["recall"] == 0
+    row = dict(zip(SCORES, brief_row("blind", brief_figures(nothing)), strict=True))
+    assert (row["missed"], row["false alarm"], row["unknown"]) == ("0.00 %", "0.00 %", "100.00 %")
 
 
 def test_free_cells_on_rocks_or_out_of_view_are_shares_of_free_cells(tmp_path, truth, frames):
