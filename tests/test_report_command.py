@@ -7,6 +7,8 @@ from html.parser import HTMLParser
 import cv2
 import numpy as np
 
+from recordings.comparison.text import moment
+from recordings.reporting.run_facts import read_facts
 from tests.conftest import SMALL, rewrite, roverflow
 
 VOID = {"meta", "img", "link", "line", "circle", "polyline"}
@@ -82,12 +84,23 @@ def test_two_results_stand_beside_each_other(traverse, result, tmp_path):
     assert len([name for name, _ in page.images if name == "/nav/navigation_map of the worst frame"]) == 2
 
 
+def test_a_result_beside_another_is_drawn_at_the_same_stamps(result):
+    alone = read_facts(result)
+    stamps = [stamp for stamp, _ in alone.drawn.values()]
+    other = dict(zip(alone.drawn, ((stamp, {}) for stamp in reversed(stamps)), strict=True))
+    drawn = read_facts(result, other).drawn
+    assert [stamp for stamp, _ in drawn.values()] == stamps[::-1] != stamps
+    assert all("/nav/disparity" in messages for _, messages in drawn.values())
+    assert read_facts(result, {"typical frame": (1, {})}).drawn.keys() == alone.drawn.keys()
+
+
 def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, capsys):
     right, out = "/stereo/right/image_rect_color", tmp_path / "out.mcap"
     cut = rewrite(traverse, tmp_path / "cut.mcap", lambda topic, at, data: None if (topic, at) == (right, 1) else data)
     assert roverflow("run", cut, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
     assert roverflow("report", out) == 0
-    assert "<td>left</td><td>1700086400513000000</td><td>unmatched</td>" in out.with_suffix(".html").read_text()
+    row = f"<td>left</td><td>{moment(1700086400513000000)}</td><td>unmatched</td>"
+    assert row in out.with_suffix(".html").read_text()
     out.with_suffix(".html").write_text("my own page")
     assert roverflow("report", out) == 2
     assert "exists and is no report of roverflow" in capsys.readouterr().err

@@ -40,15 +40,10 @@ def comparison(found: Diff) -> str:
 
 
 def markdown(found: Diff) -> str:
-    """The difference as Markdown tables."""
-    rows = [f"| {name} | {_line(item)} |" for name, item in found.topics.items() if item.first is not None]
+    """The difference as Markdown: a paragraph for each topic, as the viewer wraps no cells of a table."""
+    lines = [f"**{name}**: {_line(item)}\n" for name, item in found.topics.items() if item.first is not None]
     facts = [f"| {name} | {a or '-'} | {b or '-'} |".replace("\n", "<br>") for name, (a, b) in found.facts.items()]
-    return "\n".join(
-        [
-            "| topic | difference |", "|---|---|", *rows, "",
-            *(["| fact | A | B |", "|---|---|---|", *facts] if facts else []),
-        ]
-    )  # fmt: skip
+    return "\n".join([*lines, *(["| fact | A | B |", "|---|---|---|", *facts] if facts else [])])
 
 
 def _line(item: TopicDiff) -> str:

@@ -32,7 +32,8 @@ def write_report(path: Path, results: Sequence[Path]) -> None:
     UnwritableError
         If the page cannot be written.
     """
-    facts = [read_facts(result) for result in results]
+    facts = [read_facts(results[0])]
+    facts += [read_facts(result, facts[0].drawn) for result in results[1:]]
     names = " and ".join(found.path.name for found in facts)
     parts = [
         f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
@@ -134,7 +135,8 @@ def _losses(facts: RunFacts) -> str:
         return f"<p>{'No loss is recorded before the log ends' if facts.unreadable else 'Nothing was lost'}.</p>"
     left_out = len(facts.losses) - MAX_LOSSES
     more = f"<p>{counted(left_out, 'more loss', 'more losses')} in /nav/diagnostics.</p>" if left_out > 0 else ""
-    return html_table(facts.losses[:MAX_LOSSES], ("stream", "stamp, ns", "reason", "detail")) + more
+    rows = [(stream, moment(int(stamp)), *why) for stream, stamp, *why in facts.losses[:MAX_LOSSES]]
+    return html_table(rows, ("stream", "stamp", "reason", "detail")) + more
 
 
 def _parameters(facts: RunFacts) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,8 +45,10 @@ class RunFacts:
     regional: dict[str, Any] = field(default_factory=dict)
 
 
-def read_facts(path: Path) -> RunFacts:
+def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) -> RunFacts:
     """Read a result log twice: once for its figures, and once for the frames that are drawn.
+
+    beside: what is drawn of a result that stands beside it; the frames of the same stamps are drawn, if it has them.
 
     Raises
     ------
@@ -58,7 +61,9 @@ def read_facts(path: Path) -> RunFacts:
     for topic, stamp, message in iter_decoded(path, TOPICS, facts.unreadable):
         _add(facts, topic, stamp, message)
     facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
-    chosen = _chosen(facts)
+    chosen = {name: stamp for name, (stamp, _) in (beside or {}).items()}
+    if not chosen or not set(chosen.values()) <= set(facts.stamps):
+        chosen = _chosen(facts)
     frames = {stamp: dict[str, Any]() for stamp in chosen.values()}
     if frames:
         for topic, stamp, message in iter_decoded(path, TOPICS[:3], Counter()):
