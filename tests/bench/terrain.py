@@ -38,7 +38,8 @@ from recordings.source.tilt_noise import WINDOW, TiltNoise
 from stages.data import Array, Cell, Disparity, Mount, PixelOrigin, StereoFrame, Tilt, Transform
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
-RUNS = {"rover": "rover", "paper": "paper", "rover, true disparity and tilt": "rover"}
+RUNS = {name: name for name in ("rover", "fast", "accurate", "paper")} | {"rover, true disparity and tilt": "rover"}
+DEFAULT_RUNS = ("rover", "paper", "true")
 TILT_SAMPLES = 10  # after a frame, from which a pipeline takes what it smooths over
 TERRAIN_STREAMS = ("cloud", "cleaned", "points", "cells", "elevation_map", "navigation_map")
 
@@ -187,7 +188,7 @@ def main(given: Sequence[str] | None = None) -> None:
     parser.add_argument("--camera", type=float, nargs=3, default=default, metavar=names, help=camera)
     parser.add_argument("--scenes", choices=SCENES, nargs="+", default=["gravel", "mixed"], help="looks of the ground")
     parser.add_argument("--size", type=arguments.size, default=(1280, 960), metavar="WxH", help="of the images")
-    parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=list(RUNS))
+    parser.add_argument("--runs", nargs="+", choices=[*RUNS, "true"], default=DEFAULT_RUNS)
     parser.add_argument("--rings", action="store_true", help="also the score by distance")
     parser.add_argument("--json", type=Path, help="all metrics into this file")
     options = parser.parse_args(given)
