@@ -7,6 +7,7 @@ import struct
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from flow.cli.explanation import why
 from flow.cli.instants import part_of
@@ -17,7 +18,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
-from tests.conftest import FRAMES, SMALL, rewrite, roverflow, slow
+from tests.conftest import FRAMES, SMALL, edit_of, rewrite, roverflow, slow
 
 AT = 1.0
 
@@ -196,6 +197,25 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     assert "is a regional map: give --cell" in capsys.readouterr().err
     assert roverflow("why", fast_result, *late[:2], "--cell", "999,1", *late[3:]) == 2
     assert "outside the regional map in 'odom'" in capsys.readouterr().err
+
+
+def test_a_regional_map_without_the_frame_at_the_instant_says_so(traverse, fast_result, tmp_path, capsys):
+    *_, before, last = messages(fast_result, "/nav/pose")
+
+    def tip(index, message):
+        if message.header.stamp.sec * 10**9 + message.header.stamp.nanosec > (before + last) // 2:
+            turn = Rotation.from_quat([getattr(message.orientation, axis) for axis in "xyzw"])
+            turn *= Rotation.from_rotvec([0.0, np.deg2rad(15.0), 0.0])
+            for axis, value in zip("xyzw", turn.as_quat().tolist(), strict=True):
+                setattr(message.orientation, axis, value)
+
+    log = rewrite(traverse, tmp_path / "in.mcap", edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", tip))
+    assert roverflow("run", log, "-p", "fast", *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd") == 3
+    capsys.readouterr()
+    words = ("--at", f"{last}", "--cell", "3,0", "--map", "regional_navigation_map")
+    assert roverflow("why", tmp_path / "out.mcap", *words) == 0
+    until = f"note: the 'regional_navigation_map' from --at on has only frames up to {moment(before)}\n"
+    assert capsys.readouterr().out.startswith(until)
 
 
 def test_transforms_for_viewers_do_not_hide_the_frames_that_saw_a_cell(traverse, tmp_path):

@@ -98,10 +98,11 @@ def why_regional(
     else:
         with input_of(graph, result, log) as opened:
             stamp, begin = ns_of(at, opened.begin), opened.begin
-    navigation, terrain = _maps(result, stamp, stream, node.inputs["elevation"])
+    navigation, terrain, written = _maps(result, stamp, stream, node.inputs["elevation"])
     if navigation.stamp < stamp:
-        late = f"{(navigation.stamp - begin) / 1e9:.3f} s" if isinstance(at, float | int) else moment(navigation.stamp)
-        say(f"note: --at is after the last '{stream}', which is explained; it is at {late}")
+        end = f"{(navigation.stamp - begin) / 1e9:.3f} s" if isinstance(at, float | int) else moment(navigation.stamp)
+        last = f"--at is after the last '{stream}', which is explained; it is at {end}"
+        say(f"note: {last if written < stamp else f'the {stream!r} from --at on has only frames up to {end}'}")
     place = index_of(navigation, *cell)
     if place is None:
         raise UsageError(f"({cell[0]:g}, {cell[1]:g}) is outside the regional map in '{navigation.frame_id}'")
@@ -114,12 +115,15 @@ def why_regional(
     )
 
 
-def _maps(result: Path, at: int, stream: str, elevation: str) -> tuple[NavigationMap, ElevationMap]:
-    """The maps of the first frame from `at` on that has both, else of the last one."""
+def _maps(result: Path, at: int, stream: str, elevation: str) -> tuple[NavigationMap, ElevationMap, int]:
+    """The maps of the first frame from `at` on that has both, else of the last one; and the frame's stamp.
+
+    The maps' own stamps are earlier where frames were left out, or the map began again with that frame.
+    """
     found = None
     for frame in read_result(result, [stream, elevation]):
         if stream in frame.items and elevation in frame.items:
-            found = frame.items[stream], frame.items[elevation]
+            found = frame.items[stream], frame.items[elevation], frame.stamp
             if frame.stamp >= at:
                 break
     if found is None:
