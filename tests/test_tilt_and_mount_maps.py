@@ -26,6 +26,7 @@ def scored(folder: Path, seed: int, **parameters: Any) -> tuple[list[float], flo
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_maps_with_an_estimated_tilt_have_at_most_1_5_of_the_errors(tmp_path):
     seeds = (1, 2, 3)
     exact, estimated = (

@@ -19,7 +19,7 @@ from flow.contracts import counted
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import MAX_CHUNK_BYTES
+from recordings.mcap.chunk import HEAD_BYTES, MAX_STORED_BYTES
 
 _ROWS_AT_ONCE = 1000
 
@@ -58,21 +58,34 @@ class Db3File:
     @cached_property
     def timeline(self) -> Timeline:
         """Channel and log time of every message, in the order of recording."""
-        return Timeline(self._rows[1], np.where(self._rows[2] < 0, -1, self._rows[2]))
+        return Timeline(self._rows[1], np.maximum(self._rows[2], -1, out=self._rows[2]))
 
     def messages(
         self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels in log-time order; see `Container`."""
+        return self._read(channels, start, end, places, MAX_STORED_BYTES)
+
+    def _read(
+        self, channels: set[int], start: int | None, end: int | None, places: range | None, size: int
+    ) -> Iterator[RawMessage | LostMessage]:
+        """The first `size` bytes of messages; the rest as in `messages`."""
         timeline, kept = self.timeline, range(len(self.timeline)) if places is None else places
         chosen = timeline.places_of(channels)
         times = timeline.log_times[chosen]
         inside = (chosen >= kept.start) & (chosen < kept.stop)
         chosen = chosen[inside & (times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
-        for place in chosen[np.argsort(timeline.log_times[chosen], kind="stable")].tolist():
-            channel, log_time = int(timeline.channels[place]), int(timeline.log_times[place])
-            data = self._data_or_reason(int(self._rows[0][place]))
-            yield LostMessage(channel, log_time, data) if isinstance(data, str) else RawMessage(channel, log_time, data)
+        chosen = chosen[np.argsort(timeline.log_times[chosen], kind="stable")]
+        del times, inside  # there may be millions
+        for first in range(0, len(chosen), _ROWS_AT_ONCE):
+            block = chosen[first : first + _ROWS_AT_ONCE]
+            columns = (column[block].tolist() for column in (timeline.channels, timeline.log_times, self._rows[0]))
+            for channel, log_time, row in zip(*columns, strict=True):
+                data = self._data_or_reason(row, size)
+                if isinstance(data, str):
+                    yield LostMessage(channel, log_time, data)
+                else:
+                    yield RawMessage(channel, log_time, data)
         if end is None and kept.stop >= len(timeline):
             damaged = np.isin(timeline.channels, sorted(channels)) & (timeline.log_times < 0)
             for channel in timeline.channels[damaged].tolist():
@@ -80,8 +93,8 @@ class Db3File:
             yield from self.lost
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
-        """The messages of some channels; they have to be read as a whole."""
-        return self.messages(channels)
+        """The first bytes of the messages of some channels, with their headers."""
+        return self._read(channels, None, None, None, HEAD_BYTES)
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
@@ -139,13 +152,13 @@ class Db3File:
             for column, values in zip(columns, zip(*rows, strict=True), strict=True):
                 column.extend(values)
 
-    def _data_or_reason(self, row: int) -> memoryview | str:
-        """The bytes of the message in a row, or why it is lost."""
+    def _data_or_reason(self, row: int, size: int) -> memoryview | str:
+        """The first `size` bytes of the message in a row, or why it is lost."""
         try:
             with self._database.blobopen("messages", "data", row, readonly=True) as blob:
-                if len(blob) > MAX_CHUNK_BYTES:
-                    return f"row {row} of the file has {len(blob)} bytes; the limit is {MAX_CHUNK_BYTES}"
-                return memoryview(blob.read())
+                if len(blob) > MAX_STORED_BYTES:  # known without reading it
+                    return f"row {row} of the file has {len(blob)} bytes; the limit is {MAX_STORED_BYTES}"
+                return memoryview(blob.read(size))
         except (sqlite3.Error, ValueError, OverflowError) as error:
             return f"row {row} of the file is broken ({sentence_of(error)})"
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.contracts import counted
 from recordings.containers.container import LostMessage
 from recordings.inventory.search_range import search_range
 from recordings.scoring.result_log import about_run, pipeline_of
@@ -17,7 +19,28 @@ from recordings.source.log import McapLog
 from stages.data import StereoCamera, Tilt
 
 MAX_VERIFIED_BYTES = 300_000_000  # of a log whose messages are all read; it takes a second
+MAX_SENTENCES = 20_000  # about damage; there may be millions
 Stamps = NDArray[np.int64]
+
+
+@dataclass
+class Damage:
+    """Sentences about damage, the first ones of many. left_out: the number of the others."""
+
+    sentences: list[str]
+    left_out: int = 0
+
+    def append(self, sentence: str) -> None:
+        """Add a sentence."""
+        if len(self.sentences) < MAX_SENTENCES:
+            self.sentences.append(sentence)
+        else:
+            self.left_out += 1
+
+    def listed(self) -> list[str]:
+        """The distinct sentences."""
+        more = [f"{counted(self.left_out, 'more message')} cannot be read"] if self.left_out else []
+        return [*dict.fromkeys(self.sentences), *more]
 
 
 def describe(
@@ -30,8 +53,8 @@ def describe(
     ns, to the largest one around a frame; None: do not count frames with a tilt.
     """
     resolution, lost = log.resolution, log.file.lost
-    damage = sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems})
-    delays = list[int]()
+    damage = Damage(sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems}))
+    delays = array("q")
     stamps = {stream: _stamps(log, stream, damage, delays if stream == "left" else None) for stream in CAMERAS}
     stamps["inclinometer"] = (_tilts if _is_verified(log) else _tilt_stamps)(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
@@ -69,7 +92,7 @@ def describe(
             if stream in resolution.unavailable
         },
         "undecodable": resolution.undecodable,
-        "damage": list(dict.fromkeys(damage)),
+        "damage": damage.listed(),
     }
 
 
@@ -99,14 +122,14 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
     return found
 
 
-def _stamps(log: McapLog, stream: str, damage: list[str], delays: list[int] | None = None) -> list[int]:
+def _stamps(log: McapLog, stream: str, damage: Damage, delays: array[int] | None = None) -> Stamps:
     """The stamps of a camera's images, ns, without decoding them; losses are added to `damage`.
 
     delays: receives the log times less the stamps, ns.
     """
     if stream not in log.topics:
-        return []
-    topic, stamps = log.topics[stream], []
+        return np.zeros(0, np.int64)
+    topic, stamps = log.topics[stream], array("q")
     for raw in (log.file.messages if _is_verified(log) else log.file.heads)(log.channels(stream)):
         if not isinstance(raw, LostMessage):
             stamps.append(log.stamp_of(raw) or raw.log_time)
@@ -114,23 +137,23 @@ def _stamps(log: McapLog, stream: str, damage: list[str], delays: list[int] | No
                 delays.append(raw.log_time - stamps[-1])
         elif raw.channel is not None:
             damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
-    return stamps
+    return np.asarray(stamps, np.int64)
 
 
-def _tilts(log: McapLog, damage: list[str]) -> list[int]:
+def _tilts(log: McapLog, damage: Damage) -> Stamps:
     """The stamps of the tilts, ns; errors are added to `damage`. Nothing is estimated for them."""
     if log.resolution.tilt is not None and log.resolution.tilt.gyroscope:
         return _stamps(log, "inclinometer", damage)
-    stamps = []
+    stamps = array("q")
     for _, stream, item in log.events(("inclinometer",)):
         if isinstance(item, Tilt):
             stamps.append(item.stamp)
         elif stream == "inclinometer":
             damage.append(str(item))
-    return stamps
+    return np.asarray(stamps, np.int64)
 
 
-def _tilt_stamps(log: McapLog, damage: list[str]) -> list[int]:
+def _tilt_stamps(log: McapLog, damage: Damage) -> Stamps:
     """The stamps of the tilts of a large log, ns, without decoding them."""
     return _stamps(log, "inclinometer", damage)
 
@@ -140,11 +163,12 @@ def _is_verified(log: McapLog) -> bool:
     return log.file.size <= MAX_VERIFIED_BYTES
 
 
-def _distinct(log: McapLog, stream: str, damage: list[str], stamps: list[int]) -> Stamps:
+def _distinct(log: McapLog, stream: str, damage: Damage, stamps: Stamps) -> Stamps:
     """The sorted unique stamps; repeated ones are noted in `damage`."""
-    distinct = np.unique(np.array(stamps, np.int64))
+    distinct = np.unique(stamps)
     if repeated := len(stamps) - distinct.size:
-        damage.append(f"{log.topics[stream]}: {repeated} of {len(stamps)} messages repeat a stamp; a run drops them")
+        what = f"{repeated} of {len(stamps)} messages repeat a stamp; a run drops them"
+        damage.sentences.append(f"{log.topics[stream]}: {what}")
     return distinct
 
 

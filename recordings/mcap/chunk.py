@@ -21,9 +21,12 @@ from recordings.errors import LogError
 from recordings.mcap.index import RECORD, Index, read_at
 
 MAX_CHUNK_BYTES = 1 << 28  # of a chunk or message, unpacked; recorders make chunks of a few MB
+MAX_STORED_BYTES = 1 << 27  # of a message as stored; 21 million pixels in colour have half of it
+HEAD_BYTES = 64  # of a message; they contain the stamp of its header
 MAX_RATIO = 200  # of unpacked to packed bytes; more is a hostile file
 _FREE_BYTES, _FREE_FILE_BYTES = 1 << 26, 1 << 30  # to which any chunk, and any file, may unpack
 _FREE_PARTS_BYTES = 1 << 31  # likewise; some parts are unpacked several times
+_MAX_PARTS_RATIO = 50  # of all parts together, beyond that
 CHUNK_HEAD_BYTES = 128  # of a chunk record; they contain its length
 
 Buffer = bytes | memoryview
@@ -43,9 +46,9 @@ class Unpacking:
     def of(self, packed: Buffer, unpack: Callable[[Buffer, int], Buffer], size: int) -> Buffer:
         """The first `size` bytes by `unpack`. Raises LogError where there are too many already."""
         if self._left < 0:
-            raise LogError(f"the parts of the log unpack to over {MAX_RATIO} times their size: no recording does")
+            raise LogError(f"the log's parts unpack to over {_MAX_PARTS_RATIO} times their size: no recording does")
         found = unpack(packed, size)
-        self._left += MAX_RATIO * len(packed) - len(found)
+        self._left += _MAX_PARTS_RATIO * len(packed) - len(found)
         return found
 
 

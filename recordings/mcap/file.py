@@ -26,7 +26,7 @@ from recordings.containers.container import Channel, LostMessage, MessageSchema,
 from recordings.containers.timeline import MAX_LOG_TIME, Timeline
 from recordings.containers.unpacking import ZSTD_MAGIC
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import MAX_CHUNK_BYTES, check_size, chunk_heads, unpack_chunk
+from recordings.mcap.chunk import HEAD_BYTES, MAX_CHUNK_BYTES, check_size, chunk_heads, unpack_chunk
 from recordings.mcap.index import (
     MESSAGE,
     PARSE_ERRORS,
@@ -37,11 +37,10 @@ from recordings.mcap.index import (
     opened,
     read_at,
 )
-from recordings.mcap.message_order import ChunkMessages, LastTable, OpenChunks, Ordered, in_log_time_order
+from recordings.mcap.message_order import ChunkMessages, LastTable, OpenChunks, Ordered, in_log_time_order, too_long
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for
 
-HEAD_BYTES = 64  # of a message; they contain the stamp of its header
 Edges = tuple[int | None, int | None]  # log times, ns, from which and before which messages are read
 
 
@@ -273,10 +272,10 @@ class McapFile:
             range(len(outside)) if places is None else range(*np.searchsorted(all_places, [places.start, places.stop]))
         )
         for number in in_log_time_order(own, times, channels, kept):
-            size = sizes[number] if max_bytes is None else min(sizes[number], max_bytes)
-            data = memoryview(read_at(self._file, offsets[number], size))
-            log_time = int(times[number])
-            yield log_time, number, RawMessage(int(own[number]), log_time, data)
+            channel, log_time, size = int(own[number]), int(times[number]), sizes[number]
+            lost = too_long(channel, log_time, size)
+            data = b"" if lost else read_at(self._file, offsets[number], min(size, max_bytes or size))
+            yield log_time, number, lost or RawMessage(channel, log_time, memoryview(data))
 
     def _chunks(self, channels: set[int]) -> list[ChunkIndex]:
         """The chunks with messages of the channels (or of unknown channels), in file order."""

@@ -13,6 +13,7 @@ from mcap.records import ChunkIndex
 from numpy.typing import ArrayLike, NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
+from recordings.mcap.chunk import MAX_STORED_BYTES
 from recordings.mcap.index import MESSAGE, PARSE_ERRORS, RECORD, lost_chunk
 
 MAX_OPEN_BYTES = 1 << 28  # of unpacked chunks that overlap in time; those used longest ago are unpacked again when due
@@ -96,6 +97,8 @@ class ChunkMessages(Sequence[RawMessage | LostMessage]):
 
     def __getitem__(self, number: int) -> RawMessage | LostMessage:  # type: ignore[override]  # no slices
         channel, log_time = self._table.channels[number], self._table.times[number]
+        if lost := too_long(channel, log_time, self._table.ends[number] - self._table.starts[number]):
+            return lost
         try:
             records = self._records()
             data = memoryview(records)[self._table.starts[number] : self._table.ends[number]]
@@ -111,6 +114,13 @@ class ChunkMessages(Sequence[RawMessage | LostMessage]):
         for number in in_log_time_order(own, self._table.times, channels, places):
             yield self._table.times[number], number, self
         self._close()
+
+
+def too_long(channel: int, log_time: int, length: int) -> LostMessage | None:
+    """The loss of a message that is longer than any recorder writes."""
+    if length <= MAX_STORED_BYTES:
+        return None
+    return LostMessage(channel, log_time, f"the message has {length} bytes; the limit is {MAX_STORED_BYTES}")
 
 
 # Log time in ns; place in the chunk; the item, or the chunk that has it at that place, so that nothing waits unpacked

@@ -108,7 +108,7 @@ def store_of(schema_name: str, schema_encoding: str, text: bytes) -> SharedTypes
 
 def is_packed(data: bytes | memoryview) -> bool:
     """Whether rosbag2 compressed a message by itself."""
-    return data[: len(_ZSTD_MAGIC)] == _ZSTD_MAGIC
+    return bytes(data[: len(_ZSTD_MAGIC)]) == _ZSTD_MAGIC  # a memoryview compares slowly
 
 
 def plain(data: bytes | memoryview, size: int = MAX_CHUNK_BYTES) -> bytes | memoryview:

@@ -24,7 +24,8 @@ MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
 
-_MAX_WAITING_BYTES = 300_000_000  # of messages while calibrations and transforms are read ahead
+_MAX_WAITING_BYTES = 200_000_000  # of messages while calibrations and transforms are read ahead
+_ITEM_BYTES = 1000  # of a message that waits, beside its data
 
 T = TypeVar("T")
 
@@ -164,4 +165,4 @@ def with_lookahead(
 
 
 def _size(raw: RawMessage | LostMessage) -> int:
-    return len(raw.data) if isinstance(raw, RawMessage) else 0
+    return _ITEM_BYTES + (len(raw.data) if isinstance(raw, RawMessage) else 0)

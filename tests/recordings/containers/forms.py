@@ -1,5 +1,6 @@
 """A log in other containers, written by the rosbags library."""
 
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,13 @@ def _write(folder: Path, rows: list[Row], plugin: StoragePlugin, mode: Compressi
             writer.write(connections[topic], log_time, data)
 
 
-def write_bag(rows: list[Row], path: Path, compression: Bag1Writer.CompressionFormat | None = None) -> Path:
-    """Write a ROS 1 bag."""
+def write_bag(
+    rows: list[Row],
+    path: Path,
+    compression: Bag1Writer.CompressionFormat | None = None,
+    more: Iterable[tuple[str, int, bytes]] = (),
+) -> Path:
+    """Write a ROS 1 bag. more: topic of the rows, log time and data of messages that are written as they are."""
     writer, connections = Bag1Writer(path), dict[str, Any]()
     if compression is not None:
         writer.set_compression(compression)
@@ -71,4 +77,6 @@ def write_bag(rows: list[Row], path: Path, compression: Bag1Writer.CompressionFo
                 log_time,
                 bytes(ROS1.serialize_ros1(as_ros1(standard_types().deserialize_cdr(data, kind)), kind)),
             )
+        for topic, log_time, data in more:
+            writer.write(connections[topic], log_time, data)
     return path

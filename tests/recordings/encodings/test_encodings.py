@@ -242,7 +242,7 @@ def test_compressed_messages_may_unpack_to_200_times_their_size_in_all(monkeypat
     decode = decoder_of(Channel(1, "/name", "cdr", MessageSchema("std_msgs/msg/String", "ros2msg", b"string data")))[1]
     packed = zstandard.compress(b"\0\1\0\0" + struct.pack("<I", 400_000) + bytes(400_000))
     assert [len(decode(packed).data) for _ in range(3)] == [399_999] * 3
-    with pytest.raises(LogError, match="the parts of the log unpack to over 200 times their size"):
+    with pytest.raises(LogError, match="the log's parts unpack to over 50 times their size"):
         decode(packed)
 
 

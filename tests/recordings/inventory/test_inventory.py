@@ -13,7 +13,8 @@ from recordings import McapSource
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
 from recordings.inventory.text import format_description
-from recordings.mcap.file import HEAD_BYTES, McapFile
+from recordings.mcap.chunk import HEAD_BYTES
+from recordings.mcap.file import McapFile
 from recordings.ros2.to_msg import transform_message
 from stages.data import Transform
 from tests.conftest import rewrite

@@ -1,5 +1,6 @@
 """Small files that unpack to much, or state much, cost at most 500 MB and 20 s, and one sentence."""
 
+import sqlite3
 import struct
 import zlib
 from collections.abc import Callable
@@ -12,8 +13,9 @@ import numpy as np
 import pytest
 import zstandard
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
 
 from recordings.errors import LogError
 from recordings.mcap import chunk, message_order, walk
@@ -21,9 +23,9 @@ from recordings.mcap.file import McapFile
 from recordings.mcap.index import MESSAGE
 from recordings.ros2.cdr import make
 from tests.conftest import rewrite
-from tests.fuzz.isolation import isolated
+from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
-from tests.recordings.encodings.rewritten import ROS1
+from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
 from tests.recordings.sample_log import LEFT, START, TILT, essence, items_of, write_sample
 
 Extra = Callable[[Writer, dict[str, int]], object]
@@ -90,9 +92,13 @@ def packed(megabytes: int, states_size: bool) -> bytes:
     return b"".join(packer.compress(bytes(1 << 20)) for _ in range(megabytes)) + packer.flush()
 
 
-def many_messages(writer: Writer, channels: dict[str, int], count: int) -> None:
-    schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
-    channel = writer.register_channel("/tiny", "cdr", schema)
+def many_messages(writer: Writer, channels: dict[str, int], count: int, topic: str = "") -> None:
+    """Messages of a known topic, or of one of their own."""
+    if topic:
+        channel = channels[topic]
+    else:
+        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+        channel = writer.register_channel("/tiny", "cdr", schema)
     for number in range(count):
         writer.add_message(channel, START + number, NOTHING, START)
 
@@ -118,16 +124,34 @@ def messages_of(data: bytes, count: int) -> Extra:
     ]
 
 
-def bag(folder: Path) -> Path:
-    """A ROS 1 bag whose chunks unpack to 60 MB each."""
-    path = folder / "log.mcap"
-    writer = BagWriter(path)
-    writer.set_compression(BagWriter.CompressionFormat.BZ2)
-    with writer:
-        camera = writer.add_connection(LEFT, "sensor_msgs/msg/Image", typestore=ROS1)
-        for number in range(200):
-            writer.write(camera, START + number, bytes(60 << 20))
-    return path
+def bag(compression: BagWriter.CompressionFormat) -> Callable[[Path], Path]:
+    """The sample as a ROS 1 bag, with chunks more that unpack to 60 MB each."""
+    more = ((LEFT, START + number, bytes(60 << 20)) for number in range(200))
+    return lambda folder: write_bag(
+        rows_of(write_sample(folder / "sample.mcap")), folder / "log.mcap", compression, more
+    )
+
+
+def database(count: int, data: str, topic: str = LEFT, kind: str = "") -> Callable[[Path], Path]:
+    """The sample as a database with more messages of a topic. data: in SQL; kind: the type of a new topic."""
+
+    def write(folder: Path) -> Path:
+        (path,) = write_rosbag2(
+            rows_of(write_sample(folder / "sample.mcap")), folder / "bag", StoragePlugin.SQLITE3
+        ).glob("*.db3")
+        opened = sqlite3.connect(path.rename(folder / "log.mcap"))
+        with opened:
+            if kind:
+                row = (topic, kind, "cdr", "", "")
+                columns = "name, type, serialization_format, offered_qos_profiles, type_description_hash"
+                opened.execute(f"INSERT INTO topics ({columns}) VALUES (?, ?, ?, ?, ?)", row)
+            ((number,),) = opened.execute("SELECT id FROM topics WHERE name = ?", (topic,))
+            more = ((number, START + place) for place in range(count))
+            opened.executemany(f"INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, {data})", more)
+        opened.close()
+        return folder / "log.mcap"
+
+    return write
 
 
 def schema_of(text: str) -> Extra:
@@ -157,13 +181,15 @@ SMALL = {
     "jpeg of 30000x30000": lambda: images(jpeg(30000), 30000),
     "messages of 200 MB": lambda: with_extra(messages_of(packed(200, states_size=False), 2)),
     "schema of 5 MB": lambda: with_extra(schema_of("".join(f"float64 f{number}\n" for number in range(300_000)))),
+    "database with messages of 200 MB": lambda: database(2, "zeroblob(200000000)"),
     "channels of 20 MB": lambda: with_extra(lambda *to: large_channels(*to, 200)),
 }
 LARGE = {
     "png of 30000x30000": lambda: images(png(30000), 30000),
     "png of 16 bits": lambda: images(png(4500, bits=16, colour=6), 4500),
     "messages of 60 GB in all": lambda: with_extra(messages_of(packed(60, states_size=True), 1000)),
-    "bag of 12 GB": lambda: bag,
+    "bag of 12 GB in bz2": lambda: bag(BagWriter.CompressionFormat.BZ2),
+    "bag of 12 GB in lz4": lambda: bag(BagWriter.CompressionFormat.LZ4),
     "messages of 4 GB": lambda: with_extra(messages_of(packed(4000, states_size=False), 5)),
     "messages that state 4 GB": lambda: with_extra(messages_of(packed(4000, states_size=True), 5)),
     "comments of 5 MB": lambda: with_extra(schema_of("# x\n" * 1_300_000)),
@@ -172,6 +198,14 @@ LARGE = {
     "chunk of 2 GB": lambda: with_extra(messages_of(bytes(2000 << 20), 1), chunk_size=1 << 31),
     "chunks of 60 MB that overlap": lambda: overlapping(40, 60),
     "6 million messages": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000)),
+    "6 million messages in a database": lambda: database(
+        6_000_000, f"x'{NOTHING.hex()}'", "/tiny", "std_msgs/msg/Float64"
+    ),
+    "messages of 200 MB in chunks": lambda: with_extra(
+        messages_of(bytes(200 << 20), 20), compression=CompressionType.NONE
+    ),
+    "messages of 200 MB outside chunks": lambda: with_extra(messages_of(bytes(200 << 20), 20), use_chunking=False),
+    "database with messages of 120 MB": lambda: database(20, "zeroblob(120000000)"),
     "2 million messages in one chunk": lambda: with_extra(
         lambda *to: many_messages(*to, 2_000_000), chunk_size=1 << 31
     ),
@@ -185,6 +219,22 @@ LARGE = {
 def test_a_hostile_log_costs_little(tmp_path, name):
     path = SMALL[name]()(tmp_path)
     assert isolated(lambda: read_log(path)).fault == ""
+
+
+IN_USE = {
+    "chunks": lambda: with_extra(lambda *to: many_messages(*to, 1_000_000, TILT)),
+    "a database": lambda: database(1_000_000, f"x'{NOTHING.hex()}'", TILT),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("name", IN_USE)
+def test_a_million_damaged_messages_in_use_cost_little_memory(tmp_path, name):
+    assert isolated(lambda: IN_USE[name]()(tmp_path), limited=False).fault == ""
+    found = [isolated(partial(read, tmp_path / "log.mcap"), limited=False) for read in (read_info, read_events)]
+    assert [outcome.fault for outcome in found] == ["", ""]
+    assert max(outcome.megabytes for outcome in found) < MAX_MEGABYTES
 
 
 @pytest.mark.slow
@@ -237,3 +287,15 @@ def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tm
         assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
         counts.append(len(times))
     assert counts[1] > counts[0]
+
+
+@pytest.mark.parametrize("use_chunking", [True, False])
+def test_a_message_that_no_recorder_writes_is_lost_alone(tmp_path, whole, use_chunking):
+    layout = {"use_chunking": use_chunking, "compression": CompressionType.NONE}
+    path = with_extra(messages_of(bytes(140 << 20), 1), **layout)(tmp_path)
+    found = items_of(path)
+    lost = [str(item) for _, _, item in found if isinstance(item, LogError)]
+    assert lost == [f"{LEFT}: the message has 146800640 bytes; the limit is 134217728"]
+    assert [essence(item) for _, _, item in found if not isinstance(item, LogError)] == [
+        essence(item) for _, _, item in whole
+    ]
