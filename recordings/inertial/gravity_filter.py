@@ -29,6 +29,8 @@ REST_SIGMA = 0.005  # of a mean acceleration at rest
 MIN_DISTURBANCE = 0.02**2  # (m/s^2)^2/Hz, of a sensor that moves
 START_SIGMA = 0.5  # of gravity before the first block
 GIVEN_GRAVITY_SIGMA = 0.02
+USUAL_DISTURBANCE = 0.02  # (m/s^2)^2/Hz, of a rover that drives
+USUAL_BLOCKS = 100  # measured blocks that count as much as the usual disturbance
 DISTURBANCE_BLOCKS = 100  # over which the disturbance is measured
 DISTURBANCE_SPANS = (1, 2, 4, 8, 16)  # blocks
 MAX_SURPRISE = 3.0  # sigmas; a block that is farther off counts less
@@ -79,6 +81,7 @@ def disturbance(forces: Array) -> float:
 
     forces: (n, 3) of blocks in motion. The variance of a mean of T seconds, times T, is that density where it is white;
     slow accelerations show in the longer means. The largest counts. A drift of the gyroscope is a trend, left out.
+    Few blocks measure it badly, so it is drawn to the usual one.
     """
     number = len(forces)
     if number < 2 * DISTURBANCE_SPANS[1]:
@@ -91,7 +94,8 @@ def disturbance(forces: Array) -> float:
         if means >= 4:
             part = rest[: means * span].reshape(means, span, 3).mean(axis=1)
             densities.append(float(part.var(axis=0, ddof=1).mean()) * span * BLOCK_NS / 1e9)
-    return max(*densities, MIN_DISTURBANCE)
+    measured = (number * max(densities) + USUAL_BLOCKS * USUAL_DISTURBANCE) / (number + USUAL_BLOCKS)
+    return max(measured, MIN_DISTURBANCE)
 
 
 def is_rest(blocks: Blocks, at: int, state: GravityState) -> bool:
