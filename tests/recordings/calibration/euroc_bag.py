@@ -1,20 +1,47 @@
-"""Writes images and raw Imu of a folder in EuRoC's layout as the ROS 1 bag that ASL publishes, with Kalibr's file."""
+"""Writes images and raw Imu of a folder in EuRoC's layout as the ROS 1 bag that ASL publishes, with Kalibr's file.
+
+Or as that bag converted to ROS 2, in several files.
+"""
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import yaml
 from rosbags.rosbag1 import Writer
+from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_typestore
 
-STORE = get_typestore(Stores.ROS1_NOETIC)
+from tests.recordings.containers.forms import write_rosbag2
+
+STORE, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_JAZZY)
 LEAD_NS = 2_000_000_000  # of the Imu before the first and after the last image
 
 
 def euroc_bag(folder: Path, out: Path) -> Path:
     """A bag of the topics /cam0/image_raw, /cam1/image_raw and /imu0; folder: mav0."""
+    with Writer(out) as writer:
+        connections = {}
+        for topic, kind, stamp, message in _messages(folder):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
+            writer.write(connections[topic], stamp, STORE.serialize_ros1(message, kind))
+    return out
+
+
+def euroc_rosbag2(folder: Path, out: Path) -> Path:
+    """The same as a rosbag2 folder of three databases."""
+    rows = [
+        (topic, kind, stamp, bytes(ROS2.ros1_to_cdr(STORE.serialize_ros1(message, kind), kind)))
+        for topic, kind, stamp, message in _messages(folder)
+    ]
+    return write_rosbag2(rows, out, StoragePlugin.SQLITE3, parts=3)
+
+
+def _messages(folder: Path) -> list[tuple[str, str, int, Any]]:
+    """Topic, type, stamp and ROS 1 message of each image and sample, in the order of stamps."""
     messages = []
     for cam in ("cam0", "cam1"):
         for path in sorted((folder / cam / "data").glob("*.png")):
@@ -28,14 +55,8 @@ def euroc_bag(folder: Path, out: Path) -> Path:
         for stamp, *values in csv.reader(row for row in file if not row.startswith("#")):
             if first < int(stamp) < last:
                 messages.append((int(stamp), "/imu0", _imu(int(stamp), *np.array(values, float).reshape(2, 3))))
-    with Writer(out) as writer:
-        connections = {}
-        for stamp, topic, message in sorted(messages, key=lambda each: each[0]):
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=STORE)
-            writer.write(connections[topic], stamp, STORE.serialize_ros1(message, kind))
-    return out
+    ordered = sorted(messages, key=lambda each: each[0])
+    return [(topic, message.__msgtype__, stamp, message) for stamp, topic, message in ordered]
 
 
 def kalibr_camchain(folder: Path, out: Path) -> Path:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from recordings import McapSource
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
-from tests.recordings.calibration.euroc_bag import euroc_bag, kalibr_camchain
+from tests.recordings.calibration.euroc_bag import euroc_bag, euroc_rosbag2, kalibr_camchain
 from tests.recordings.sample_log import HEIGHT, LEFT, RIGHT, WIDTH, data_folder, dropped, items_of, write_sample
 
 INTRINSICS = [[458.6, 457.3, 367.2, 248.4], [457.6, 456.1, 379.9, 255.2]]
@@ -207,10 +207,11 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, content):
         read_calibration([tmp_path / "file.yaml"])
 
 
-def test_euroc_as_a_ros_1_bag_with_kalibrs_calibration_is_rectified(tmp_path):
+@pytest.mark.parametrize("write", [euroc_bag, euroc_rosbag2])
+def test_euroc_in_rosbags_with_kalibrs_calibration_is_rectified(tmp_path, write):
     folder = data_folder("euroc") / "mav0"
-    bag, chain = euroc_bag(folder, tmp_path / "room.bag"), kalibr_camchain(folder, tmp_path / "camchain.yaml")
-    with McapSource(calibration=str(chain)).open(bag) as log:
+    written, chain = write(folder, tmp_path / "room.bag"), kalibr_camchain(folder, tmp_path / "camchain.yaml")
+    with McapSource(calibration=str(chain)).open(written) as log:
         assert not {"left", "right", "inclinometer", "mount"} & log.missing.keys()
         items = list(log.events())
     tilts = [item for _, stream, item in items if stream == "inclinometer"]
