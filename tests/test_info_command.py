@@ -7,9 +7,12 @@ import shlex
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from flow.config.loader import SHIPPED
 from recordings.mcap.file import iter_decoded
+from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import read_disparity
 from tests.conftest import FRAMES, roverflow
 from tests.recordings.sample_log import LEFT, RIGHT, TILT, dropped, write_sample
@@ -37,12 +40,37 @@ def test_info_reports_why_a_run_would_refuse_the_log(traverse, capsys):
     assert why in capsys.readouterr().err
 
 
+CAMERA_TOPICS = ("image_rect", "camera_info")
 REFUSED = {
     "names": {"names": ("/a/picture", "/b/picture")},
     "no calibration": {"edit": dropped("/stereo/left/camera_info", "/stereo/right/camera_info")},
     "no tilt": {"edit": dropped(TILT)},
     "no mount": {"edit": dropped("/tf_static")},
+    "bare numbers": {"edit": lambda topic, number, message: numbers(message) if topic == TILT else message},
+    "two tilts": {"twice": [TILT]},
+    "two pairs": {"twice": [f"/stereo/{side}/{kind}" for side in ("left", "right") for kind in CAMERA_TOPICS]},
 }
+
+
+def numbers(message):
+    """The accelerations of an Imu alone, as an inclinometer logs them."""
+    vector = make("geometry_msgs/msg/Vector3", x=0.1, y=0.2, z=9.8)
+    return make("geometry_msgs/msg/Vector3Stamped", header=message.header, vector=vector)
+
+
+def with_copies(log, out, topics):
+    """A log with some topics also below /more."""
+    with log.open("rb") as stream, out.open("wb") as file:
+        writer, channels = Writer(file), {}
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(stream).iter_messages():
+            for topic in [channel.topic] + [f"/more{channel.topic}"] * (channel.topic in topics):
+                if topic not in channels:
+                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    channels[topic] = writer.register_channel(topic, "cdr", known)
+                writer.add_message(channels[topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    return out
 
 
 CAMERA = {
@@ -55,7 +83,9 @@ KALIBR = {"cam0": CAMERA, "cam1": {**CAMERA, "T_cn_cnm1": RIGHT_FROM_LEFT}}
 
 @pytest.mark.parametrize("fault", REFUSED)
 def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, tmp_path, capsys):
-    log, file = write_sample(tmp_path / "log.mcap", **REFUSED[fault]), tmp_path / "calibration.yaml"
+    changes, file = dict(REFUSED[fault]), tmp_path / "calibration.yaml"
+    twice = changes.pop("twice", [])
+    log = with_copies(write_sample(tmp_path / "sample.mcap", **changes), tmp_path / "log.mcap", twice)
     file.write_text(json.dumps(KALIBR))  # JSON is YAML
     assert roverflow("info", log) == 2
     offered = capsys.readouterr().out.partition("what would supply it:\n")[2].splitlines()
