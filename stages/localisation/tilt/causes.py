@@ -132,7 +132,7 @@ def _exchanges() -> tuple[tuple[str, str, Array], ...]:
         settings = ["the fields of source.pitch and source.roll"] if swapped else []
         settings += [f"source.{name}.sign" for name in names if name != "up"]
         settings += ["the direction of up"] if z < 0 else []
-        remedy = f"Check {' and '.join(settings)}, or the axes of the inclinometer's driver."
+        remedy = f"Check the axes of the inclinometer's driver; for a log of bare angles, {' and '.join(settings)}."
         found.append((" and ".join(parts), remedy, undo))
     return tuple(found)
 
