@@ -28,20 +28,13 @@ SMALL = ("--set", "disparities=64")
 @pytest.fixture(scope="session")
 def traverse(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated log of a few small frames, with ground truth."""
-    from recordings.simulator import Simulation, write_log
-
-    simulation = Simulation(**TRAVERSE)
-    return made_once(tmp_path_factory, "traverse/traverse.mcap", lambda path: write_log(simulation, path))
+    return _simulated(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
-def result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The traverse, run through the default pipeline; its recording and its summary are beside it."""
-
-    def run(out: Path) -> None:
-        assert roverflow("run", traverse, *SMALL, "-o", out, "--summary", out.with_suffix(".json")) == 0
-
-    return made_once(tmp_path_factory, "result/out.mcap", run)
+    return _run(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
@@ -55,10 +48,25 @@ def fast_result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kernels(request: pytest.FixtureRequest) -> None:
+def kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Of several processes of pytest, one compiles the kernels of the default pipeline, and the others wait for it."""
     if "PYTEST_XDIST_WORKER" in os.environ:
-        request.getfixturevalue("result")
+        _run(tmp_path_factory)  # no fixture, because files have fixtures of the same name
+
+
+def _simulated(factory: pytest.TempPathFactory) -> Path:
+    from recordings.simulator import Simulation, write_log
+
+    simulation = Simulation(**TRAVERSE)
+    return made_once(factory, "traverse/traverse.mcap", lambda path: write_log(simulation, path))
+
+
+def _run(factory: pytest.TempPathFactory) -> Path:
+    def run(out: Path) -> None:
+        words = (*SMALL, "-o", out, "--summary", out.with_suffix(".json"))
+        assert roverflow("run", _simulated(factory), *words) == 0
+
+    return made_once(factory, "result/out.mcap", run)
 
 
 def made_once(factory: pytest.TempPathFactory, place: str, make: Callable[[Path], object]) -> Path:
