@@ -133,9 +133,7 @@ class Binarise(Stage):
         found = {
             "no slope or roughness": ~(np.isfinite(slope) & np.isfinite(roughness)),
             f"support below {MIN_SUPPORT:g}": ~(support >= MIN_SUPPORT),
-            "possibly too steep (steepness_error)": ~(
-                steepness + self.steepness_error * (steepness - slope) <= limit
-            ),
+            "possibly too steep (steepness_error)": ~(steepness + self.steepness_error * (steepness - slope) <= limit),
             "on an obstacle that the edge of view cuts (min_rise)": self._cut(elevation, observed, above, step),
             "at a brink (min_drop)": self._brink(elevation),
             f"within {RIM:g} m of an obstacle": _dilated(obstacle, RIM / elevation.resolution),

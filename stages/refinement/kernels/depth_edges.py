@@ -202,5 +202,6 @@ def sharpen_edges_reference(
             - ODDS_PER_NEAR_LEVEL * close
         )
         if (odds > 0) != (disparity[y, x] > middle):
-            sharp[y, x] = around[(around > middle) == (odds > 0)].mean(dtype=np.float32)
+            side = around[(around > middle) == (odds > 0)]
+            sharp[y, x] = np.cumsum(side)[-1] / F32(side.size)  # one after the other, as the kernel adds them
     return sharp
