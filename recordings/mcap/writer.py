@@ -69,7 +69,7 @@ class Ros2Writer:
         self._schemas: dict[MessageKind, int] = {}
         self._channels: dict[tuple[str, int | None], tuple[int, MessageKind]] = {}
         self._counts: dict[int, int] = {}
-        self._digests: defaultdict[str, Any] | None = defaultdict(hashlib.sha256) if digests else None
+        self._digests: defaultdict[str, Any] | None = defaultdict(hashlib.sha1) if digests else None
         self._partial = self._temporary_name()
         with writing(self.path):
             self._file = self._open()

@@ -1,7 +1,8 @@
 """The price of a frame, from log to result log and recording, beside one match by OpenCV.
 
 Every run is a process of its own, started from the command line as a user would. A frame's CPU time is that of a long
-run less that of a short one, over the frames between them: so it has no share in starting, which is printed by itself.
+run less that of a short one, over the frames between them: so it has no share in starting, which is printed by itself,
+nor in what the first judgement of the tilt imports.
 OpenCV matches between the runs, on one thread, because the speed of a machine changes within minutes. Figures are
 medians of the rounds. Compiled kernels come from the cache, which a first short run fills.
 """
@@ -28,7 +29,7 @@ from stages.matching.intensity import gray
 
 SIZES = {"1280x960": 192, "640x480": 96, "240x180": 48}
 PIPELINES = {"1280x960": ("rover", "fast", "accurate", "paper"), "640x480": ("rover", "fast"), "240x180": ("rover",)}
-SHORT, LONG, ROUNDS = 6, 36, 3
+SHORT, LONG, ROUNDS = 16, 46, 3
 PAPER = (2, 8, 1)  # of `paper`, which takes 50 times as long as `fast`
 TO_POINTS = ("cloud", "cleaned", "points", "cells")  # Reproject, Clean, Level, Voxelise
 BEFORE = ("rectified", "disparity")  # the stages up to the disparity
