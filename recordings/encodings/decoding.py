@@ -49,7 +49,7 @@ def decoder_of(channel: Channel, unpacking: Unpacking | None = None) -> tuple[st
         if encoding == "cdr" and is_packed(data):
             data = unpacking.of(data, plain, limit + 1)
         if len(data) > limit:
-            raise LogError(f"it has more than {limit} bytes; messages other than images have at most so many")
+            raise LogError(f"it has more than {limit} bytes, the limit of {ros_name}")
         return decode(data) if adapt is None else adapt(decode(data))
 
     return ros_name, decoded

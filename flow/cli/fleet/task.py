@@ -72,7 +72,7 @@ class Pipeline:
 
 def _forget_others(folder: Path) -> None:
     """Forget modules that travelled with other pipelines: a worker that stays has them from an earlier fleet."""
-    for name, module in list(sys.modules.items()):
+    for name, module in sys.modules.copy().items():  # another thread may import
         home = Path(getattr(module, "__file__", None) or "").parent
         if home.name.startswith(_TRAVELLED) and home.name != folder.name:
             del sys.modules[name]
