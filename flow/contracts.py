@@ -170,6 +170,8 @@ class Sink(Protocol):
     - `prepare(stream, item)`: what `write` gets in place of an item, such as its encoded bytes. Any thread calls it as
       soon as the item is there, frames in any order, so it must not depend on other calls. The engine does not keep the
       item longer for this sink;
+    - `asks`: parameter -> value that the run gives to the stages that have the parameter at its default, so that they
+      make more for this sink; no other result may change by it;
     - `discard()`: gives up the output and keeps an existing file, where no frame got through or another output failed;
     - `empty`: whether there is nothing worth keeping; the run then calls `discard`.
     """

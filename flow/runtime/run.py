@@ -135,7 +135,7 @@ def run(
     SinkError
         An output could not be written. All outputs are closed by then.
     """
-    graph = with_spare_threads(fitted(graph, log), log.frames, workers)
+    graph = with_spare_threads(asked(fitted(graph, log), outputs), log.frames, workers)
     every = every or Every()
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))
     stop, ledger = stop or Stop(), Ledger()
@@ -192,6 +192,18 @@ def fitted(graph: Graph, log: Log) -> Graph:
         return graph.without(log.missing)
     except PipelineError as error:
         raise UsageError(str(error)) from None
+
+
+def asked(graph: Graph, outputs: Mapping[str, Path]) -> Graph:
+    """The graph whose stages make what its sinks ask for."""
+    asks = [item for use, sink in graph.sinks if use in outputs for item in getattr(sink, "asks", {}).items()]
+    nodes = list(graph.nodes)
+    for i, node in enumerate(nodes):
+        for name, value in asks:
+            default = getattr(type(node.actor), name, None)
+            if not node.aligns and default is not None and getattr(node.actor, name) == default:
+                nodes[i] = node = replace(node, actor=replace(node.actor, **{name: value}))
+    return replace(graph, nodes=tuple(nodes))
 
 
 def with_spare_threads(graph: Graph, frames: int | None, workers: int) -> Graph:

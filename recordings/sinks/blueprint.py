@@ -45,9 +45,9 @@ _Part = rrb.View | rrb.Container
 # The places of the layout. Derived images have another size than the camera's; OWN_... are of the user's own types.
 Panel = Enum(
     "Panel",
-    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE MATCH_CONFIDENCE CONFIDENCE SIGMA DEPTH "
-    "DIFFERENCE CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES STAGE "
-    "OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
+    "LEFT RIGHT LEFT_DERIVED RIGHT_DERIVED DISPARITY SUPERPIXELS SOURCE COST LEAD MATCH_CONFIDENCE CONFIDENCE SIGMA "
+    "DEPTH DIFFERENCE CLOUD VOXELS TERRAIN CAMERA TRAJECTORY RELIEF LAYER MAP REASON ANGLE HEALTH MATCHES FEATURES "
+    "STAGE OWN_IMAGE OWN_NUMBER OWN_TEXT OWN_BARS OWN_TENSOR",
 )
 
 ERRORS = (Panel.CONFIDENCE, Panel.SIGMA, Panel.DIFFERENCE)  # what is known of the last disparity's
@@ -131,10 +131,12 @@ def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """Both images and their difference, disparity and origin of each step, and what is known of its errors."""
     disparities, sources = _flat_views(drawn, Panel.DISPARITY), _flat_views(drawn, Panel.SOURCE)
     parts = [
-        *_image_tabs(drawn), _tabs(_flat_views(drawn, Panel.DIFFERENCE)), _tabs(reversed(_superpixels(drawn))),
+        *_image_tabs(drawn), _tabs(_flat_views(drawn, Panel.DIFFERENCE)),
+        _tabs([*_flat_views(drawn, Panel.COST), *reversed(_superpixels(drawn))]),
         _tabs(disparities[-2::-1]), _tabs([*disparities[-1:], *_flat_views(drawn, Panel.DEPTH)]),
         _tabs(sources[-2::-1]), _tabs(sources[-1:]),
-        *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.MATCH_CONFIDENCE, Panel.CONFIDENCE, Panel.SIGMA)),
+        _tabs([*_flat_views(drawn, Panel.LEAD), *_flat_views(drawn, Panel.MATCH_CONFIDENCE)]),
+        *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.CONFIDENCE, Panel.SIGMA)),
         _panel(drawn, Panel.MATCHES, MATCHED, in_tab=False),
     ]  # fmt: skip
     return _grid(parts, 4) or _ledger(drawn)

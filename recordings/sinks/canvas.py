@@ -19,11 +19,13 @@ import rerun as rr
 
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import CURVES, LEDGER, LEDGER_CHARS, Panel, ViewSpec
-from recordings.sinks.colormaps import Legend, Rgb
+from recordings.sinks.colormaps import UNKNOWN_RGB, Legend, Rgb
 from recordings.sinks.png import png
-from stages.data import Array, StereoCamera
+from stages.data import Array, ElevationMap, NavigationMap, StereoCamera
 
 TEXT_RGB: Rgb = (225, 228, 235)
+CAMERA_RGB: Rgb = (255, 210, 60)
+VEIL: tuple[int, int, int, int] = (96, 100, 112, 170)  # over guesses
 CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
 LEGEND_COLUMNS = (4, 3)  # of a single row, and of several, which have the longer names
 VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
@@ -64,6 +66,7 @@ class Canvas:
     _present: dict[str, set[int]] = field(default_factory=dict)
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
+    _veiled: set[str] = field(default_factory=set)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
 
@@ -164,7 +167,7 @@ class Canvas:
         self.add_view(view)
         if palette != cv2.COLORMAP_TURBO:  # which begins with nearly black
             mask = _raw(rr.SegmentationImage, np.isnan(values).view(np.uint8))
-            self._log(f"{view.path}/unknown", rr.SegmentationImage, [*mask, *_opaque_where_unknown()])
+            self._log(f"{view.path}/unknown", rr.SegmentationImage, [*mask, *_masking("unknown", UNKNOWN_RGB)])
         if unit is not None:
             self.log_legend(f"{view.path}/scale", values.shape, _scale(low, high, unit, palette, hazard))
 
@@ -176,16 +179,24 @@ class Canvas:
         view: ViewSpec,
         unit: str,
         palette: int = cv2.COLORMAP_TURBO,
+        veiled: tuple[str, Array | None] = ("", None),
     ) -> None:
         """Numbers of steps (H, W), uint16, as PNG, in colours from 0 to `limit`; hover reads units of `per_unit` steps.
 
-        limit: in units. The viewer draws such images of 8 bits black.
+        limit: in units; veiled: a name, and which pixels (H, W) bool are faint. The viewer draws such images of 8 bits
+        black.
         """
         self.log_blob(
             view.path, rr.EncodedDepthImage, png(steps), view, media_type="image/png", meter=per_unit,
             colormap=VIEWER_COLORMAPS[palette], depth_range=(0.0, limit * per_unit),
         )  # fmt: skip
-        self.log_scale(f"{view.path}/scale", steps.shape, 0.0, limit, unit, palette)
+        name, faint = veiled
+        if faint is not None and (faint.any() or name in self._veiled):
+            self._veiled.add(name)
+            mask = _raw(rr.SegmentationImage, np.ascontiguousarray(faint).view(np.uint8))
+            self._log(f"{view.path}/{name}", rr.SegmentationImage, [*mask, *_masking(name, VEIL)])
+        entries = [(name, VEIL[:3])] if name in self._veiled and faint is not None else []
+        self.log_legend(f"{view.path}/scale", steps.shape, [*_scale(0.0, limit, unit, palette), *entries])
 
     def log_labels(
         self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False, counts: Array | None = None
@@ -215,6 +226,25 @@ class Canvas:
         named = tuple(entries)
         self.keep(path, (shape, named), lambda: _dots(shape, named, beside))
         self.keep(f"{path}/text", (shape, named), lambda: _names(shape, named, beside))
+
+    def log_distances(self, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
+        """Lines across a bird's-eye view at every second metre of x, with distances; the rover's place and way."""
+        content, thin = (shape, grid.origin, grid.resolution, colormaps.rover_place(grid)), rr.Radius.ui_points(0.6)
+        lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
+        points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
+        self.keep(path, content, lambda: rr.LineStrips2D(colormaps.distance_lines(*content)[0], **lines))
+        self.keep(
+            f"{path}/distances",
+            content,
+            lambda: rr.Points2D(**colormaps.distance_lines(*content)[1], show_labels=True, **points),
+        )
+
+        ways = colormaps.way_on(grid, shape, self.ways.get(grid.frame_id, []))
+        if ways:
+            self.log(
+                f"{path}/way",
+                rr.LineStrips2D(ways, colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.2), draw_order=22.0),
+            )
 
     def limits(self, path: str, low: float, high: float) -> tuple[float, float]:
         """The lowest and the highest value given for `path` so far, so that a scale stays."""
@@ -252,11 +282,11 @@ def _recurring(kind: Any, **fields: Any) -> tuple[rr.DescribedComponentBatch, ..
 
 
 @cache
-def _opaque_where_unknown() -> list[rr.DescribedComponentBatch]:
-    """How a mask of unknown values is drawn: 1 in `UNKNOWN_RGB`, 0 not at all."""
+def _masking(name: str, color: tuple[int, ...]) -> list[rr.DescribedComponentBatch]:
+    """How a mask is drawn: 1 in a colour, 0 not at all."""
     labels = [
         rr.AnnotationInfo(id=0, label="known", color=(0, 0, 0, 0)),
-        rr.AnnotationInfo(id=1, label="unknown", color=colormaps.UNKNOWN_RGB),
+        rr.AnnotationInfo(id=1, label=name, color=color),
     ]
     opaque = _recurring(rr.SegmentationImage, opacity=1.0)
     return [*opaque, *rr.AnnotationContext(labels).as_component_batches()]
@@ -305,9 +335,10 @@ def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bo
     dots, _, rows, row_height = _places(shape, len(entries), beside)
     colors, radii = [rgb for _, rgb in entries], [5.0] * len(entries)
     if not beside:
-        # The view ends at the uppermost point, so one without extent keeps the first row's dots whole.
-        dots, colors = [*dots, (shape[1] / 2, -(rows + HEADROOM) * row_height)], [*colors, (0, 0, 0)]
-        radii.append(0.0)
+        # The view ends at the uppermost points, unless they are few among many; so points without extent keep the first
+        # row's dots whole.
+        above = [(x, -(rows + HEADROOM) * row_height) for x, y in dots if y == dots[0][1]]
+        dots, colors, radii = [*dots, *above], colors + [(0, 0, 0)] * len(above), radii + [0.0] * len(above)
     return rr.Points2D(dots, colors=colors, radii=rr.Radius.ui_points(radii), draw_order=30.0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,8 +12,7 @@ from flow.contracts import counted
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
-from recordings.sinks.canvas import Canvas, label_counts
-from recordings.sinks.colormaps import Rgb
+from recordings.sinks.canvas import CAMERA_RGB, Canvas, label_counts
 from recordings.sinks.png import png
 from stages.data import (
     LEVEL_FRAME,
@@ -46,12 +44,12 @@ LAYER_SCALES = {
 }  # fmt: skip
 DIFFERENCE_STEPS = 0.25  # the difference of the images is drawn to 4 gray levels
 MAX_DIFFERENCE = 32  # gray levels, the upper end of the scale of the images' difference
+MAX_COST = 255.0  # the upper end of the scales of sums of costs, which are bytes
 MAX_SIGMA = 0.5  # px, the upper end of the scale of the disparities' standard deviation
 MAX_CELLS = 4000  # known ones, of a surface and of the layers of a map; a relief has all
 MAX_DEPTH = 16.0  # m, the upper end of the scale of depths
 MIN_DEPTH = 0.2  # m in front of the camera, of what is drawn over its image
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
-CAMERA_RGB: Rgb = (255, 210, 60)
 THUMBNAIL_SCALE = 0.25  # of the image in the camera's frustum
 
 Logger = Callable[..., str | None]
@@ -108,7 +106,8 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
     caption = f"{stream} {', '.join([f'{share:.0f} % known', *parts])}"
     if not canvas.pictures:
         return caption
-    _log_pixels(canvas, stream, disparity.pixels, width)
+    filled = source == PixelOrigin.FILLED if stream in canvas.full_size else None
+    _log_pixels(canvas, stream, disparity.pixels, width, filled)
     if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
         canvas.log_labels(view, source, colormaps.SOURCE_LEGEND, beside=True, counts=counts)
@@ -116,7 +115,9 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         _log_confidence(canvas, ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence"), disparity)
         _log_sigma(canvas, stream, disparity)
         _log_depth(canvas, stream, disparity)
-    elif stream in canvas.matched and disparity.segments is None:
+    if disparity.costs is not None and canvas.camera and disparity.pixels.shape[1] == canvas.camera.width:
+        _log_costs(canvas, stream, disparity.costs)
+    if stream in canvas.matched and disparity.segments is None:
         title = f"{stream}: confidence of the match"
         _log_confidence(canvas, ViewSpec(Panel.MATCH_CONFIDENCE, stream, "confidence", title), disparity)
     if disparity.segments is not None:
@@ -139,6 +140,15 @@ def _log_confidence(canvas: Canvas, view: ViewSpec, disparity: Disparity) -> Non
     canvas.log_values(np.rint(percent).astype(np.uint8), (20.0, 100.0), view, "%")
 
 
+def _log_costs(canvas: Canvas, stream: str, costs: Array) -> None:
+    """What the search found at every n-th pixel: its lowest cost, and by how much that beats the next lowest."""
+    lowest, next_lowest = (colormaps.every_nth(layer, canvas.small_width) for layer in costs)
+    view = ViewSpec(Panel.COST, stream, "cost", f"{stream}: lowest cost")
+    canvas.log_values(np.ascontiguousarray(lowest), (0.0, MAX_COST), view, "")
+    view = ViewSpec(Panel.LEAD, stream, "lead", f"{stream}: lead over the next cost")
+    canvas.log_values(next_lowest - np.minimum(lowest, next_lowest), (0.0, MAX_COST), view, "")
+
+
 def _log_sigma(canvas: Canvas, stream: str, disparity: Disparity) -> None:
     """The standard deviation of every n-th disparity."""
     if disparity.sigma is not None:
@@ -158,13 +168,14 @@ def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         canvas.log_values(depth.astype(np.float16), (0.0, MAX_DEPTH), view, "m")
 
 
-def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int) -> None:
-    """The disparities of every n-th pixel, with their scale."""
+def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int, filled: Array | None) -> None:
+    """The disparities of every n-th pixel, with their scale. filled: which of these are faint, as guesses are."""
     # Rounded; NaN and negative values become 0.
     thinned = np.ascontiguousarray(colormaps.every_nth(pixels, max_width))
     steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
     _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(thinned))
-    canvas.log_steps(steps, DISPARITY_STEPS, limit, ViewSpec(Panel.DISPARITY, stream, "pixels", stream), "px")
+    view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)
+    canvas.log_steps(steps, DISPARITY_STEPS, limit, view, "px", veiled=("filled", filled))
 
 
 @logger_for(PointCloud)
@@ -253,7 +264,7 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     relief = ViewSpec(Panel.RELIEF, stream, "relief", f"relief{suffix}")
     canvas.log_exact(relief.path, colormaps.birds_eye(rgb), relief)
     canvas.log_scale(f"{relief.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
-    _log_distances(canvas, f"{relief.path}/lines", terrain.shape, terrain)
+    canvas.log_distances(f"{relief.path}/lines", terrain.shape, terrain)
     caption = f"{stream} {counted(int(np.count_nonzero(np.isfinite(elevation))), 'cell')}"
     if not canvas.pictures:
         return caption
@@ -288,7 +299,7 @@ def log_navigation(canvas: Canvas, stream: str, navigation: NavigationMap) -> st
     cells, suffix = colormaps.birds_eye(navigation.cells), _frame_suffix(navigation.frame_id)
     view = ViewSpec(Panel.MAP, stream, "cells", f"navigation{suffix}")
     canvas.log_labels(view, cells, colormaps.CELL_LEGEND)
-    _log_distances(canvas, f"{view.path}/lines", navigation.cells.shape, navigation)
+    canvas.log_distances(f"{view.path}/lines", navigation.cells.shape, navigation)
     reason = ViewSpec(Panel.REASON, stream, "reason", f"reason{suffix}")
     canvas.log_labels(reason, colormaps.birds_eye(navigation.reason), colormaps.REASON_LEGEND)
     free, hazard = (int(np.count_nonzero(cells == state)) for state in (Cell.FREE, Cell.HAZARD))
@@ -379,22 +390,3 @@ def _plot_angle(canvas: Canvas, stream: str, name: str, sine: float) -> None:
 
 def _frame_suffix(frame_id: str) -> str:
     return "" if frame_id == LEVEL_FRAME else f" ({frame_id})"
-
-
-def _log_distances(canvas: Canvas, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
-    """Lines across a bird's-eye view at every second metre of x, with their distances; the rover's place and way."""
-    content, thin = (shape, grid.origin, grid.resolution, colormaps.rover_place(grid)), rr.Radius.ui_points(0.6)
-    lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
-    points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
-    canvas.keep(path, content, lambda: rr.LineStrips2D(colormaps.distance_lines(*content)[0], **lines))
-    canvas.keep(
-        f"{path}/distances",
-        content,
-        lambda: rr.Points2D(**colormaps.distance_lines(*content)[1], show_labels=True, **points),
-    )
-
-    ways = colormaps.way_on(grid, shape, canvas.ways.get(grid.frame_id, []))
-    if ways:
-        canvas.log(
-            f"{path}/way", rr.LineStrips2D(ways, colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.2), draw_order=22.0)
-        )

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -59,6 +59,7 @@ class RerunSink:
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     suffix = ".rrd"
+    asks: ClassVar = {"keep_costs": True}  # of matchers
 
     def __post_init__(self) -> None:
         check_parameters(self)

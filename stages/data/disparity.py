@@ -30,6 +30,9 @@ class Disparity:
         The rectified camera, if it is known.
     sigma
         (H, W) float32, px, standard deviation of a known disparity that is no blunder (inf = no evidence), or None.
+    costs
+        (2, H, W) uint8: the smallest sum of costs that the search found at a pixel, and the smallest of all disparities
+        but that one and its neighbours; 255 is 255 or more. None if they were not kept.
 
     Examples
     --------
@@ -48,6 +51,7 @@ class Disparity:
     segments: Array | None = None
     camera: StereoCamera | None = None
     sigma: Array | None = None
+    costs: Array | None = None
 
     def __post_init__(self) -> None:
         publish_stamp(self)
@@ -58,6 +62,8 @@ class Disparity:
             publish(self, "segments", self.pixels.shape, np.int32)
         if self.sigma is not None:
             publish(self, "sigma", self.pixels.shape, np.float32)
+        if self.costs is not None:
+            publish(self, "costs", (2, *self.pixels.shape), np.uint8)
 
 
 @dataclass(frozen=True)

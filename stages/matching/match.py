@@ -121,6 +121,9 @@ class Match(Stage):
         "unknown", "pixels that the prior has nearer than the range: unknown, or copied from the prior",
         choices=("unknown", "prior"),
     )  # fmt: skip
+    keep_costs: bool = parameter(
+        False, "keep the smallest sums of costs of each pixel in the result; a run with a recording sets it"
+    )
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
     max_memory: int = parameter(
         400, "memory for the sums of paths; larger frames are matched in stripes, with the same result",
@@ -160,7 +163,8 @@ class Match(Stage):
             _copy_nearer(prior, search, found)
         if self.max_depth:
             _drop_farther(self._max_depth_disparity(frame.camera), found)
-        return Disparity(frame.stamp, *found, camera=frame.camera)
+        pixels, source, confidence, costs = found
+        return Disparity(frame.stamp, pixels, source, confidence, camera=frame.camera, costs=costs)
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
         height, width = frame.left.shape[:2]
@@ -267,6 +271,7 @@ class Match(Stage):
             p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=cost.unseen_cost, disparities=len(search),
             min_disparity=search.start, uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance,
             speckle_range=SPECKLE_RANGE, max_speckle_size=self.max_speckle_size, confidence_of=confidence,
+            keep_costs=self.keep_costs,
         )  # fmt: skip
 
 
@@ -274,7 +279,7 @@ def _copy_nearer(prior: Disparity, search: range, found: Matches) -> None:
     """Copy into `found` the pixels that the prior measures at or beyond the near end of the search range."""
     copied = np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED)
     copied &= (prior.pixels > search.stop - RANGE_TOLERANCE) & (prior.pixels < prior.pixels.shape[1])
-    for layer, known in zip(found, (prior.pixels, prior.source, prior.confidence), strict=True):
+    for layer, known in zip(found[:3], (prior.pixels, prior.source, prior.confidence), strict=True):
         np.copyto(layer, known, where=copied)
 
 

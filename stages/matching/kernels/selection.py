@@ -88,6 +88,17 @@ def find_partners(winner, right, partners):
 
 
 @part
+def keep_costs(votes, costs, y):
+    """Keep the sum of the winner and the smallest of the others in row y of `costs`, unless it has no rows.
+
+    votes: of `find_winners`; costs: (2, H, W) uint8.
+    """
+    if costs.shape[1]:
+        for x in range(costs.shape[2]):
+            costs[0, y, x], costs[1, y, x] = votes[0, x], votes[3, x]
+
+
+@part
 def fit_row(winner, votes, partners, first, top, params, pixels, evidence, source):
     """Disparities of a row, to a fraction of a pixel, where the winner is reliable, the evidence, and the reasons.
 
@@ -120,6 +131,13 @@ def fit_row(winner, votes, partners, first, top, params, pixels, evidence, sourc
         reason = reason if unique else UNIQUENESS
         reason = reason if in_range else OUT_OF_RANGE
         source[x] = reason if in_view else OUT_OF_VIEW
+
+
+def costs_reference(total: Array) -> Array:
+    """`keep_costs` of a row, (2, W) uint8, in plain numpy. total: of `select_reference`."""
+    lanes, best = np.arange(total.shape[1]), np.argmin(total, axis=1)
+    others = np.where(np.abs(lanes - best[:, np.newaxis]) <= 1, 255, total)
+    return np.stack([total.min(axis=1), others.min(axis=1)]).astype(np.uint8)
 
 
 def select_reference(total: Array, first: Array, lowest: int, n: int, params: SgmParams) -> tuple[Array, Array, Array]:

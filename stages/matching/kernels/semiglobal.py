@@ -30,14 +30,14 @@ from stages.matching.kernels.aggregation import aggregate_row
 from stages.matching.kernels.gradient import smoothed_costs
 from stages.matching.kernels.matching_inputs import MatchingInputs, matching_inputs
 from stages.matching.kernels.row_ranges import Range, by_range, lanes_for, move_paths
-from stages.matching.kernels.selection import find_partners, find_winners, fit_row
+from stages.matching.kernels.selection import find_partners, find_winners, fit_row, keep_costs
 from stages.matching.kernels.sgm_local import SearchWindows, match_windows
 from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.speckles import drop_speckles
 from stages.matching.kernels.texture import contrast, drop_unmatchable
 
 _workspaces = Workspaces()
-Layers = tuple[Array, Array, Array]  # disparities, evidence, source
+Layers = tuple[Array, Array, Array, Array]  # disparities, evidence, source, costs
 
 
 class Matches(NamedTuple):
@@ -46,6 +46,7 @@ class Matches(NamedTuple):
     pixels: Array  # float32, px, NaN = unknown
     source: Array  # uint8, codes of `PixelOrigin`
     confidence: Array  # float32
+    costs: Array | None  # uint8 (2, H, W), the smallest sum of paths and that of all but its neighbours
 
 
 class Scratch(NamedTuple):
@@ -85,7 +86,8 @@ def match(
         Bytes for the sums of paths.
     """
     pixels, evidence, source = (np.empty(left.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
-    layers = pixels, evidence, source
+    costs = np.empty((2, *left.shape) if params.keep_costs else (2, 0, 0), np.uint8)
+    layers = pixels, evidence, source, costs
     if excluded is None:
         excluded = np.empty((0, 0), np.uint8)
     run_both = shared_by(threads)
@@ -98,12 +100,12 @@ def match(
             _match_ranges(left, right, params, prior, search, max_memory, layers, space, run_both)
 
         def drop(first: int, end: int) -> None:
-            rows = (layer[first:end] for layer in (excluded, *layers))
+            rows = (layer[first:end] for layer in (excluded, pixels, evidence, source))
             drop_unmatchable(contrast(left, first, end), contrast(right, first, end), *rows)
 
         by_bands(run_both, len(left), drop)
         drop_speckles(pixels, evidence, source, params.speckle_range, params.max_speckle_size, space, run_both)
-    return Matches(pixels, source, cv2.LUT(evidence, params.confidence_of))
+    return Matches(pixels, source, cv2.LUT(evidence, params.confidence_of), costs if params.keep_costs else None)
 
 
 def _match_ranges(
@@ -120,7 +122,7 @@ def _match_ranges(
 @kernel
 def _sweep(inputs, params, layers, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * stride of `sums`."""
-    pixels, evidence, source = layers
+    pixels, evidence, source, costs = layers
     if params.gradient:
         for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
             smoothed_costs(inputs, params.unseen_cost, first_lane, ahead, scratch.column_sums, scratch.costs, width)
@@ -140,6 +142,7 @@ def _sweep(inputs, params, layers, width, scratch, first_lane, top, paths, y, en
                 scratch.winner, scratch.votes, scratch.partners, scratch.first, top, params, pixels[y], evidence[y],
                 source[y],
             )  # fmt: skip
+            keep_costs(scratch.votes, costs, y)
         y += step
 
 

@@ -35,7 +35,7 @@ from stages.matching.kernels.aggregation import NOT_SEARCHED, aggregate_referenc
 from stages.matching.kernels.census import PLANES, census_costs
 from stages.matching.kernels.gradient import MAX_GRADIENT_DIFFERENCE, raw_costs
 from stages.matching.kernels.matching_inputs import MatchingInputs
-from stages.matching.kernels.selection import find_winner, fit_row, select_reference
+from stages.matching.kernels.selection import costs_reference, find_winner, fit_row, keep_costs, select_reference
 from stages.matching.kernels.sgm_params import SgmParams
 
 WINDOW_STEP = 4  # windows begin at multiples of it, so most neighbouring windows begin together
@@ -85,14 +85,14 @@ def match_windows(
     inputs: MatchingInputs,
     params: SgmParams,
     windows: SearchWindows,
-    layers: tuple[Array, Array, Array],
+    layers: tuple[Array, Array, Array, Array],
     space: Workspace,
     run_both: Fork,
 ) -> None:
-    """Write disparities, evidence and source of all pixels into `layers`.
+    """Write disparities, evidence, source and costs of all pixels into `layers`.
 
     inputs: for a `min_disparity` of 0, with the prior's costs from the beginning of each window on; layers: (H, W)
-    each: float32, px, NaN = unknown; uint8; uint8, codes of `PixelOrigin`.
+    each: float32, px, NaN = unknown; uint8; uint8, codes of `PixelOrigin`; and those of `selection.keep_costs`.
     """
     first, width = windows
     height, columns = first.shape
@@ -251,7 +251,7 @@ def _cross(steps, params, width, first, costs, sums, first_min, first_max, layer
 
     A sweep that arrives with the paths in `rows` continues into these rows. The sums of the other sweep are there.
     """
-    (pixels, evidence, source), n, columns = layers, lanes_in(width), first.shape[1]
+    (pixels, evidence, source, kept), n, columns = layers, lanes_in(width), first.shape[1]
     total, best = np.empty(columns * n, np.uint8), np.empty(columns + n, np.uint8)
     order = np.arange(first_max - first_min + n).astype(np.uint16)
     chosen = np.zeros(columns + n, np.uint16)  # by the right image's pixels, backwards, less `first_min`
@@ -277,10 +277,11 @@ def _cross(steps, params, width, first, costs, sums, first_min, first_max, layer
         for x in range(columns):
             partners[x] = chosen[columns - 1 - x + begin[x] + winner[x]] + first_min - begin[x]
         fit_row(winner, votes, partners, begin, n - 1, params, pixels[y], evidence[y], source[y])
+        keep_costs(votes, kept, y)
 
 
 def match_windows_reference(inputs: MatchingInputs, params: SgmParams, windows: SearchWindows) -> list[Array]:
-    """The layers of `search_around` in plain numpy.
+    """The layers of `match_windows` in plain numpy.
 
     It works in volumes of all disparities of any window, with 255 for disparities outside the pixel's own window.
     """
@@ -297,7 +298,8 @@ def match_windows_reference(inputs: MatchingInputs, params: SgmParams, windows: 
     sums = sum(aggregate_reference(inputs.steps, params, costs, searched, sign) for sign in (1, -1))
     total = np.where(searched, np.minimum(sums, 255), 255)
     rows = [select_reference(total[y], first[y], int(first.min()), n, params) for y in range(first.shape[0])]
-    return [np.stack(layer) for layer in zip(*rows, strict=True)]
+    costs = np.stack([costs_reference(row) for row in total], axis=1)
+    return [*(np.stack(layer) for layer in zip(*rows, strict=True)), costs]
 
 
 def _raw_costs_reference(inputs: MatchingInputs, params: SgmParams, first: Array, n: int) -> Array:

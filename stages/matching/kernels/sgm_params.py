@@ -22,3 +22,4 @@ class SgmParams(NamedTuple):
     speckle_range: float
     max_speckle_size: int
     confidence_of: Array  # (256,) float32, confidence for each value of the evidence
+    keep_costs: bool

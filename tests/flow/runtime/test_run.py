@@ -11,7 +11,7 @@ import pytest
 
 from flow.errors import SinkError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
-from flow.runtime.run import run, with_spare_threads
+from flow.runtime.run import asked, run, with_spare_threads
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, traverse
 
 
@@ -42,6 +42,17 @@ def test_a_stage_shares_a_frame_among_two_workers_if_there_are_too_few_frames(tm
     found = {node.name: node.actor for node in with_spare_threads(graph(tmp_path, text=text), frames, 4).nodes}
     assert (found["twice"].threads, found["thrice"].threads) == (threads, 3)
     assert not hasattr(found["sum"], "threads")
+
+
+def test_a_stage_makes_what_a_sink_of_the_run_asks_for_unless_its_parameter_is_set(tmp_path):
+    text = PIPELINE.replace("factor: 3 m,", "factor: 3 m, size: 7 px,")
+    pipeline = graph(tmp_path, text=text)
+    (use, sink), *_ = pipeline.sinks
+    sink.asks = {"size": 2}
+    for outputs, sizes in (({use: tmp_path}, (2, 7)), ({}, (1, 7))):
+        found = {node.name: node.actor for node in asked(pipeline, outputs).nodes}
+        assert (found["twice"].size, found["thrice"].size) == sizes
+        assert not hasattr(found["sum"], "size")
 
 
 def test_frames_without_a_partner_in_another_stream_are_in_the_ledger(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 import rerun as rr
 
 from recordings.sinks.loggers import same_view
-from stages.data import LEVEL_FRAME, Cell, ElevationMap, Pose, StereoCamera, StereoFrame, Transform
+from stages.data import LEVEL_FRAME, Cell, ElevationMap, PixelOrigin, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
     HEIGHT,
     START,
@@ -69,6 +69,24 @@ def test_the_confidence_of_the_match_is_drawn_beside_that_of_the_result(tmp_path
     for stream, percent in (("matched", 40), ("disparity", 90)):
         shown = np.frombuffer(bytes(rows(path, f"/{stream}/confidence", "DepthImage:buffer")[0][2][0]), np.uint8)
         assert set(shown) == {0, percent}  # 0 is unknown
+
+
+def test_the_costs_of_the_search_are_drawn_and_filled_disparities_are_faint(tmp_path):
+    items = scene()
+    lowest = np.random.default_rng(0).integers(0, 200, (HEIGHT, WIDTH)).astype(np.uint8)
+    items["matched"] = replace(items["matched"], costs=np.stack([lowest, lowest + np.uint8(30)]))
+    source = items["disparity"].source.copy()
+    source[4:9] = PixelOrigin.FILLED
+    items["disparity"] = replace(items["disparity"], source=source)
+    path = record_of(tmp_path / "run.rrd", [Record(START, items)], max_width=3 * WIDTH)
+
+    def shown(entity, kind):
+        return np.frombuffer(bytes(rows(path, entity, f"{kind}:buffer")[0][2][0]), np.uint8).reshape(HEIGHT, WIDTH)
+
+    np.testing.assert_array_equal(shown("/matched/cost", "DepthImage"), lowest)
+    assert (shown("/matched/lead", "DepthImage") == 30).all()
+    np.testing.assert_array_equal(shown("/disparity/pixels/filled", "SegmentationImage"), source == PixelOrigin.FILLED)
+    assert not {"/disparity/cost", "/disparity/lead", "/matched/pixels/filled"} & entities(path)
 
 
 def test_superpixel_edges_lie_between_different_labels(rrd):

@@ -36,7 +36,9 @@ def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
 
 def params_of(gradient, disparities, minimum):
     nothing = np.zeros(256, np.uint8)
-    return SgmParams(gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32))
+    return SgmParams(
+        gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32), True
+    )
 
 
 @pytest.fixture(scope="module")

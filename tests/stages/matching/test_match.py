@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages.data import Disparity, PixelOrigin, StereoFrame
-from stages.matching.match import COSTS, Match
+from stages.matching.match import COSTS, LEADS, Match
 from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.stages.matching.test_match_opencv import frame_of, slanted_pair, textured
 
@@ -56,6 +56,22 @@ def test_disparities_are_not_drawn_to_whole_numbers(slope, cost):
     part = (10 * (truth % 1)).astype(int)
     bias = [np.nanmedian(error[(part == i) & (np.abs(error) < 1)]) for i in range(10)]
     assert np.abs(bias).max() < 0.06, bias
+
+
+@pytest.mark.parametrize("near", [False, True])
+def test_costs_are_kept_if_asked_for_and_change_nothing_else(slope, near):
+    frame, truth = slope
+    source, ones = np.full(truth.shape, PixelOrigin.MEASURED, np.uint8), np.ones(truth.shape, np.float32)
+    prior = Disparity(0, truth, source, ones) if near else None
+    match = Match(disparities=48, search_radius=4 if near else 0)
+    plain, kept = match(frame, prior), replace(match, keep_costs=True)(frame, prior)
+    assert plain.costs is None
+    assert kept.costs is not None
+    assert same(plain, kept)
+    lowest, next_lowest = kept.costs.astype(int)
+    lead = np.round(np.interp(plain.confidence, COSTS[match.cost].confidence, LEADS))
+    known = plain.confidence > 0
+    np.testing.assert_array_equal((next_lowest - lowest)[known], lead[known])
 
 
 def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(slope):

@@ -24,7 +24,7 @@ from stages.matching.kernels.row_ranges import (
     move_paths,
     row_ranges,
 )
-from stages.matching.kernels.selection import select_reference
+from stages.matching.kernels.selection import costs_reference, select_reference
 from stages.matching.kernels.semiglobal import match
 from stages.matching.kernels.texture import contrast, drop_unmatchable_reference
 from stages.matching.match import Match
@@ -139,22 +139,26 @@ def test_disparities_are_those_of_a_search_without_the_rest_of_the_range(
         searched[each.top : each.end, :, each.first : each.first + each.width.lanes] = True
     down, up = (aggregate_reference(inputs.steps, params, costs, searched, sign, beside=False) for sign in (1, -1))
     pixels, evidence, source = (np.empty(truth.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
+    kept = np.empty((2, *truth.shape), np.uint8)
     for each in ranges:
         n, least = min(each.width.lanes, disparities), minimum + each.first
         total = np.minimum(down + up, 255)[:, :, each.first : each.first + n]
         for y in range(each.top, each.end):
             row = select_reference(total[y], np.full(columns, least), least, n, params)
             pixels[y], evidence[y], source[y] = row
+            kept[:, y] = costs_reference(total[y])
     contrasts = (contrast(image, 0, len(image)) for image in (left, right))
     drop_unmatchable_reference(*contrasts, np.empty((0, 0), np.uint8), pixels, evidence, source)
     np.testing.assert_array_equal(found.pixels, pixels)
     np.testing.assert_array_equal(found.source, source)
     np.testing.assert_array_equal(found.confidence, params.confidence_of[evidence])
+    np.testing.assert_array_equal(found.costs, kept)
     for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
         again = match(left, right, params, guide, ranges, None, threads, memory)
         np.testing.assert_array_equal(again.pixels, found.pixels)
         np.testing.assert_array_equal(again.source, found.source)
         np.testing.assert_array_equal(again.confidence, found.confidence)
+        np.testing.assert_array_equal(again.costs, found.costs)
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,8 @@ def views(height, columns, disparity):
 
 def searched(images, params, found, guide, threads):
     left, right = images
-    layers = tuple(np.empty(left.shape, kind) for kind in (np.float32, np.uint8, np.uint8))
+    shapes = (np.float32, left.shape), (np.uint8, left.shape), (np.uint8, left.shape), (np.uint8, (2, *left.shape))
+    layers = tuple(np.empty(shape, kind) for kind, shape in shapes)
     run_both = shared_by(threads)
     inputs = matching_inputs(left, right, params._replace(min_disparity=0), found.width, guide, run_both)
     match_windows(inputs, params, found, layers, Workspace(), run_both)
@@ -41,7 +42,7 @@ def searched(images, params, found, guide, threads):
 @pytest.mark.parametrize("gradient", [True, False])
 @pytest.mark.parametrize("diagonals", [True, False])
 @pytest.mark.parametrize("lanes", [16, 32, 48])
-def test_disparities_and_evidence_are_those_of_the_reference(gradient, diagonals, lanes):
+def test_disparities_evidence_and_costs_are_those_of_the_reference(gradient, diagonals, lanes):
     rng = np.random.default_rng(lanes + gradient)
     height, columns = 11, 60
     disparity = np.where(np.arange(columns) < 30, 9.0, 21.0)  # a step, wider than the narrowest windows
