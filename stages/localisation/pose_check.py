@@ -1,7 +1,8 @@
 """Compares the steps of the logged pose with those of visual odometry.
 
 Neither is exact: wheels slip, and visual odometry drifts. But a pose that stands still while the images move, that has
-a wrong heading, or that jumps, differs by as much as the steps themselves.
+a wrong heading, or that jumps, differs by as much as the steps themselves. If most steps are
+longer in the images, the scale of the stereo camera or of the odometry is wrong; wheels that slip make them shorter.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from stages.data import Array, CameraMotion, Mount, Pose, Transform
 MIN_STEPS = 5
 MIN_STEP = 0.02  # m; shorter steps are mostly noise
 MAX_DIFFERENCE_SHARE = 0.3  # of a step
+MAX_SCALE_ERROR = 0.05  # by which three of four steps, of so many at least, may be longer in the images
+MIN_SCALED_STEPS = 10
 MIN_JUMP = 0.5  # m, and
 MIN_JUMP_RATIO = 10.0  # over the median difference
 
@@ -52,11 +55,25 @@ class PoseCheck:
                 f"{np.median(visual):.2f} m, difference {usual:.2f} m ({len(difference)} steps). Check its frame, its "
                 "heading and its unit, or run without it: visual odometry then supplies the pose."
             )
+        if scale := _scale_problem(visual, logged):
+            return scale
         jumps = difference[(difference > MIN_JUMP) & (difference > MIN_JUMP_RATIO * usual)]
         if len(jumps):
             times = counted(len(jumps), "time")
             return f"Logged odometry jumps {times} relative to visual odometry, by up to {jumps.max():.1f} m."
         return ""
+
+
+def _scale_problem(visual: Array, logged: Array) -> str:
+    """What makes most steps of the images, m, longer than the logged ones; empty if they are not."""
+    shares = visual[logged > MIN_STEP] / logged[logged > MIN_STEP]
+    if len(shares) < MIN_SCALED_STEPS or np.quantile(shares, 0.25) < 1 + MAX_SCALE_ERROR:
+        return ""
+    return (
+        f"Steps of visual odometry are {100 * (np.median(shares) - 1):.0f} % longer than those of the logged odometry "
+        f"({len(shares)} steps), which slip does not explain. The baseline or the focal length is too large, and all "
+        "distances with it, or the odometry's scale is too small."
+    )
 
 
 def _step(before: Transform, after: Transform) -> Array:

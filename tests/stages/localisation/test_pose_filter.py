@@ -160,10 +160,15 @@ def slipping(poses: list[Pose]) -> list[Pose]:
     return [replace(pose, position=1.1 * pose.position) for pose in poses]
 
 
+def dragging(poses: list[Pose]) -> list[Pose]:
+    return [replace(pose, position=pose.position / 1.1) for pose in poses]
+
+
 @pytest.mark.parametrize("based", [True, False])
 @pytest.mark.parametrize(("change", "sentence"), [
     (lambda poses: poses, None),
     (slipping, None),
+    (dragging, r"are 10 % longer than those of the logged odometry \(\d\d steps\), which slip does not explain"),
     (frozen, r"disagrees with visual odometry: median step 0\.0\d m vs 0\.\d\d m"),
     (askew, "disagrees with visual odometry"),
     (leaping, r"jumps 1 time relative to visual odometry, by up to 8\.\d m"),
