@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from recordings.containers.clock import ClockStep, clock_steps, split
 from recordings.containers.container import Channel, Container, LostMessage, RawMessage
 from recordings.containers.header import begins_with_header, peek_stamp
-from recordings.containers.timeline import Timeline
+from recordings.containers.timeline import Places, Timeline
 
 _MAX_REMEMBERED = 32  # messages of a topic, to leave out those that were recorded twice
 
@@ -82,13 +82,18 @@ class _Part:
 
     def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
         """The log times of some channels of the recording, ns, in any order."""
-        found = [np.zeros(0, np.int64)]
-        for channel in self.numbers.of_file(channels) & self.file.timeline.by_channel.keys():
-            places = self.file.timeline.by_channel[channel]
-            inside = places[(places >= self.places.start) & (places < self.places.stop)]
-            found.append(self.file.timeline.log_times[inside])
-        times = np.concatenate(found)
-        return times[times >= (0 if allow_repeats else self.step.repeats_until)] + self.step.shift
+        known = self.file.timeline.by_channel
+        inside = (self._inside(known[channel]) for channel in self.numbers.of_file(channels) & known.keys())
+        times = np.concatenate([np.zeros(0, np.int64), *(self.file.timeline.log_times[places] for places in inside)])
+        if self.step.repeats_until and not allow_repeats:
+            times = times[times >= self.step.repeats_until]
+        times += self.step.shift
+        return times
+
+    def _inside(self, places: Places) -> Places:
+        """Those of some sorted places that are in the part."""
+        first, last = np.searchsorted(places, [self.places.start, self.places.stop])
+        return places[first:last]
 
     def messages(
         self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
@@ -249,7 +254,9 @@ class Recording:
 
     def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns; by default without those that repeat."""
-        return np.sort(np.concatenate([part.times(channels, allow_repeats) for part in self._parts]))
+        times = np.concatenate([part.times(channels, allow_repeats) for part in self._parts])
+        times.sort()
+        return times
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""

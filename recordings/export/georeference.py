@@ -21,6 +21,7 @@ import numpy as np
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
+from recordings.source.settings import MAX_RATE
 from recordings.source.topics import DecodedTopics
 from stages.data import Array
 
@@ -118,7 +119,7 @@ def georeferences(result: Path, fixes: Sequence[Path], crs: str) -> dict[str, Ge
 def _fixes(log: Path) -> Array:
     """(N, 3) stamp, ns, latitude and longitude, deg, of the first topic of fixes in a log."""
     with open_recording(log) as file:
-        topics = DecodedTopics(file, 0)
+        topics = DecodedTopics(file, 0, MAX_RATE)
         named = sorted(topic for topic, schema in topics.schemas.items() if schema == FIX)
         return np.array([row for topic in named[:1] for row in _usable(topics, topic)]).reshape(-1, 3)
 

@@ -266,13 +266,13 @@ class McapFile:
         outside, offsets, sizes = self.index.unchunked
         if not outside:
             return
-        all_places = np.frombuffer(outside, np.int64)  # no copy: there may be millions
-        own, times = self.timeline.channels[all_places], np.asarray(self.index.counted_times, np.uint64)[all_places]
-        kept = (
-            range(len(outside)) if places is None else range(*np.searchsorted(all_places, [places.start, places.stop]))
-        )
-        for number in in_log_time_order(own, times, channels, kept):
-            channel, log_time, size = int(own[number]), int(times[number]), sizes[number]
+        # No copies: there may be millions.
+        all_places, times = np.frombuffer(outside, np.uint32), np.asarray(self.index.counted_times, np.uint64)
+        own, kept = self.timeline.channels[all_places], range(len(outside))
+        if places is not None:
+            kept = range(*np.searchsorted(all_places, np.array([places.start, places.stop], np.uint32)))
+        for number in in_log_time_order(own, lambda numbers: times[all_places[numbers]], channels, kept):
+            channel, log_time, size = int(own[number]), int(times[all_places[number]]), sizes[number]
             lost = too_long(channel, log_time, size)
             data = b"" if lost else read_at(self._file, offsets[number], min(size, max_bytes or size))
             yield log_time, number, lost or RawMessage(channel, log_time, memoryview(data))

@@ -56,7 +56,7 @@ class Index:
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkIndex] = field(default_factory=list)
     unchunked: tuple[array[int], array[int], array[int]] = field(
-        default_factory=lambda: (array("Q"), array("Q"), array("I"))
+        default_factory=lambda: (array("I"), array("Q"), array("I"))
     )
     rescued: list[tuple[int, RawMessage]] = field(default_factory=list)
     lost: list[LostMessage] = field(default_factory=list)

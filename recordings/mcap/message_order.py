@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.mcap.chunk import MAX_STORED_BYTES
@@ -111,7 +111,8 @@ class ChunkMessages(Sequence[RawMessage | LostMessage]):
     def in_order(self, channels: set[int], places: range) -> Iterator[Ordered]:
         """The messages of some channels in log-time order, not read yet. places: those wanted of the chunk."""
         own = np.frombuffer(self._table.channels, np.uint16) if len(self) else np.zeros(0, np.uint16)
-        for number in in_log_time_order(own, self._table.times, channels, places):
+        times = np.asarray(self._table.times, np.uint64)
+        for number in in_log_time_order(own, times.__getitem__, channels, places):
             yield self._table.times[number], number, self
         self._close()
 
@@ -128,10 +129,12 @@ Ordered = tuple[int, int, RawMessage | LostMessage | ChunkMessages]
 
 
 def in_log_time_order(
-    channels: NDArray[np.integer[Any]], times: ArrayLike, wanted: set[int], places: range
+    channels: NDArray[np.integer[Any]],
+    times_of: Callable[[NDArray[np.intp]], NDArray[np.uint64]],
+    wanted: set[int],
+    places: range,
 ) -> Iterator[int]:
     """The places of the messages of some channels, in the order of their log times, ns."""
     numbers = np.flatnonzero(np.isin(channels, sorted(wanted)))
     numbers = numbers[(numbers >= places.start) & (numbers < places.stop)]
-    order = np.argsort(np.asarray(times, np.uint64)[numbers], kind="stable")
-    return map(int, numbers[order])
+    return map(int, numbers[np.argsort(times_of(numbers), kind="stable")])

@@ -148,7 +148,7 @@ def _note_alike(index: Index, block: bytes, position: int, at: int, length: int)
     places, offsets, sizes = index.unchunked
     first = index.count_messages(records["channel"][:count], records["log_time"][:count])
     numbers = np.arange(count, dtype=np.uint64)
-    places.frombytes((numbers + np.uint64(first)).tobytes())
+    places.frombytes(np.arange(first, first + count, dtype=np.uint32).tobytes())
     offsets.frombytes((numbers * np.uint64(step) + np.uint64(position + at + RECORD.size + MESSAGE.size)).tobytes())
     sizes.frombytes(np.full(count, length - MESSAGE.size, np.uint32).tobytes())
     return count * step

@@ -44,7 +44,8 @@ class SourceResolution:
     """
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
-        self.file, self.source, self.messages = file, source, DecodedTopics(file, source.max_pixels)
+        self.file, self.source = file, source
+        self.messages = DecodedTopics(file, source.max_pixels, source.max_rate)
         self.undecodable = self._undecodable_topics()
         found = self._discovered()
         self.chosen, self.why, self.remedies = found.chosen, found.why, found.remedies

@@ -11,6 +11,8 @@ from recordings.ros2.from_msg import frame_name
 from recordings.ros2.image_from_msg import MAX_PIXELS
 from recordings.ros2.tilt_from_msg import AccelerationField, AngleField, PlainAngles
 
+MAX_RATE = 10_000  # Hz; fast inertial sensors have a tenth of it
+
 
 @dataclass(frozen=True)
 class LogSettings:
@@ -71,6 +73,10 @@ class LogSettings:
         None, "YAML file of the axes that move the camera on the rover, whose angles are in a JointState"
     )
     max_pixels: int = parameter(MAX_PIXELS, "pixels of the largest image that is decoded", low=1)
+    max_rate: int = parameter(
+        MAX_RATE, "messages per second, over ten seconds of log time, of the fastest topic that is read",
+        unit="Hz", low=1,
+    )  # fmt: skip
     base_frame: str = parameter("base_link", "the rover's frame")
 
     def __post_init__(self) -> None:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, TypeVar
 
+import numpy as np
+
 from recordings.containers.container import LostMessage, MessageSchema, RawMessage
 from recordings.containers.recording import Recording
 from recordings.encodings.decoding import MAX_SCHEMA_BYTES, Decoder, decoder_of, weight_of
@@ -21,6 +23,7 @@ from recordings.ros2.from_msg import frame_of
 from recordings.video.decoder import PixelReader, VideoDecoder, begins_video, reader_of
 
 MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
+_RATE_SECONDS = 10  # over which the rate of a topic is a mean, as recorders write late messages in bursts
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
 
@@ -70,12 +73,12 @@ class DecodedTopics:
     decoders: by channel; undecodable_channels: channel -> reason; schemas: decodable topic -> full ROS 2 type name.
     """
 
-    def __init__(self, file: Recording, max_pixels: int) -> None:
+    def __init__(self, file: Recording, max_pixels: int, max_rate: int) -> None:
         self.file, self._max_pixels = file, max_pixels
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
-        weights, unpacking = dict[MessageSchema, int](), Unpacking()
+        weights, unpacking, dense = dict[MessageSchema, int](), Unpacking(), self._dense_topics(max_rate)
         for place, (number, channel) in enumerate(file.channels.items()):
             if place >= MAX_CHANNELS:
                 self.undecodable_channels[number] = f"the log has more than {MAX_CHANNELS} channels"
@@ -83,11 +86,25 @@ class DecodedTopics:
             if channel.schema is not None and channel.schema not in weights:
                 weights[channel.schema] = weight_of(channel.schema)
             try:
+                if channel.topic in dense:
+                    raise LogError(dense[channel.topic])
                 if sum(weights.values()) > MAX_SCHEMA_BYTES:
                     raise LogError(f"the schemas of the log have more than {MAX_SCHEMA_BYTES} bytes")
                 self.schemas[channel.topic], self.decoders[number] = decoder_of(channel, unpacking)
             except LogError as error:
                 self.undecodable_channels[number] = str(error)
+
+    def _dense_topics(self, max_rate: int) -> dict[str, str]:
+        """The topics with more messages in a time than any sensor has -> a sentence."""
+        most, dense = _RATE_SECONDS * max_rate, dict[str, str]()
+        remedy = "set 'max_rate' of the source to the rate of the sensor, Hz, if it is that fast"
+        for topic in {channel.topic for channel in islice(self.file.channels.values(), MAX_CHANNELS)}:
+            channels = self.file.channels_of([topic])
+            times = self.file.times(channels, allow_repeats=True) if self.file.count(channels) > most else np.zeros(0)
+            if len(times) > most and np.min(times[most:] - times[:-most]) < _RATE_SECONDS * 1_000_000_000:
+                what = f"over {most} of its {len(times)} messages were logged within {_RATE_SECONDS} s"
+                dense[topic] = f"{what}; {remedy}"
+        return dense
 
     def pixel_reader(self, topic: str) -> PixelReader:
         """A function to the pixels of a topic's messages, in their order."""

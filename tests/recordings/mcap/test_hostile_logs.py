@@ -17,6 +17,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 
+from recordings import McapSource
 from recordings.errors import LogError
 from recordings.mcap import chunk, message_order, walk
 from recordings.mcap.file import McapFile
@@ -30,6 +31,7 @@ from tests.recordings.sample_log import LEFT, START, TILT, essence, items_of, wr
 
 Extra = Callable[[Writer, dict[str, int]], object]
 NOTHING = b"\0\1\0\0" + bytes(8)
+MILLISECOND = 1_000_000
 
 
 def with_extra(extra: Extra, **options: Any) -> Callable[[Path], Path]:
@@ -92,15 +94,15 @@ def packed(megabytes: int, states_size: bool) -> bytes:
     return b"".join(packer.compress(bytes(1 << 20)) for _ in range(megabytes)) + packer.flush()
 
 
-def many_messages(writer: Writer, channels: dict[str, int], count: int, topic: str = "") -> None:
-    """Messages of a known topic, or of one of their own."""
+def many_messages(writer: Writer, channels: dict[str, int], count: int, topic: str = "", apart: int = 1) -> None:
+    """Messages of a known topic, or of one of their own. apart: ns."""
     if topic:
         channel = channels[topic]
     else:
         schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
         channel = writer.register_channel("/tiny", "cdr", schema)
     for number in range(count):
-        writer.add_message(channel, START + number, NOTHING, START)
+        writer.add_message(channel, START + number * apart, NOTHING, START)
 
 
 def many_topics(writer: Writer, channels: dict[str, int], count: int) -> None:
@@ -132,8 +134,9 @@ def bag(compression: BagWriter.CompressionFormat) -> Callable[[Path], Path]:
     )
 
 
-def database(count: int, data: str, topic: str = LEFT, kind: str = "") -> Callable[[Path], Path]:
-    """The sample as a database with more messages of a topic. data: in SQL; kind: the type of a new topic."""
+def database(count: int, data: str, topic: str = LEFT, kind: str = "", apart: int = 1) -> Callable[[Path], Path]:
+    """The sample as a database with more messages of a topic. data: in SQL; kind: the type of a new topic;
+    apart: ns."""
 
     def write(folder: Path) -> Path:
         (path,) = write_rosbag2(
@@ -146,7 +149,7 @@ def database(count: int, data: str, topic: str = LEFT, kind: str = "") -> Callab
                 columns = "name, type, serialization_format, offered_qos_profiles, type_description_hash"
                 opened.execute(f"INSERT INTO topics ({columns}) VALUES (?, ?, ?, ?, ?)", row)
             ((number,),) = opened.execute("SELECT id FROM topics WHERE name = ?", (topic,))
-            more = ((number, START + place) for place in range(count))
+            more = ((number, START + place * apart) for place in range(count))
             opened.executemany(f"INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, {data})", more)
         opened.close()
         return folder / "log.mcap"
@@ -212,6 +215,11 @@ LARGE = {
     "6 million messages outside chunks": lambda: with_extra(
         lambda *to: many_messages(*to, 6_000_000), use_chunking=False
     ),
+    "6 million messages in use": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000, TILT)),
+    "6 million messages in use outside chunks": lambda: with_extra(
+        lambda *to: many_messages(*to, 6_000_000, TILT), use_chunking=False
+    ),
+    "6 million messages in use in a database": lambda: database(6_000_000, f"x'{NOTHING.hex()}'", TILT),
 }
 
 
@@ -222,8 +230,8 @@ def test_a_hostile_log_costs_little(tmp_path, name):
 
 
 IN_USE = {
-    "chunks": lambda: with_extra(lambda *to: many_messages(*to, 1_000_000, TILT)),
-    "a database": lambda: database(1_000_000, f"x'{NOTHING.hex()}'", TILT),
+    "chunks": lambda: with_extra(lambda *to: many_messages(*to, 1_000_000, TILT, MILLISECOND)),
+    "a database": lambda: database(1_000_000, f"x'{NOTHING.hex()}'", TILT, apart=MILLISECOND),
 }
 
 
@@ -253,6 +261,16 @@ def test_a_log_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path, monke
     monkeypatch.setattr(chunk, "_FREE_FILE_BYTES", 1 << 20)
     with pytest.raises(LogError, match="times its size: no recording does"):
         McapFile(path)
+
+
+def test_a_topic_faster_than_any_sensor_is_refused_unless_a_setting_allows_it(tmp_path, whole):
+    path = with_extra(lambda *to: many_messages(*to, 20, TILT, MILLISECOND))(tmp_path)
+    with McapSource(max_rate=2).open(path) as log:
+        assert "/imu/data: over 20 of its 25 messages were logged within 10 s" in log.missing["inclinometer"]
+        assert "set 'max_rate' of the source to the rate of the sensor" in log.missing["inclinometer"]
+    with McapSource(max_rate=3).open(path) as log:
+        found = [essence(item) for _, _, item in log.events() if not isinstance(item, LogError)]
+    assert found == [essence(item) for _, _, item in whole]
 
 
 @pytest.mark.parametrize("cut", [0, 2000, 2020])
