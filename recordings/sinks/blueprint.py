@@ -64,7 +64,8 @@ SENSOR_PLOTS = (
 class ViewSpec:
     """What a view shows: the entity `part` of a stream, in a panel, under a title.
 
-    frame_id is the frame of reference of 3-D entities.
+    frame_id is the frame of reference of 3-D entities; size is the width and height of a picture that stays in its
+    place, whatever is drawn over it.
     """
 
     panel: Panel
@@ -72,6 +73,7 @@ class ViewSpec:
     part: str
     title: str
     frame_id: str = LEVEL_FRAME
+    size: Sequence[int] = ()
 
     @property
     def path(self) -> str:
@@ -218,12 +220,13 @@ def _flat_views(drawn: Specs, *panels: Panel) -> list[rrb.View]:
     for spec in specs:
         streams.setdefault(spec.title, set()).add(spec.stream)
     ambiguous = {stream for sharing in streams.values() if len(sharing) > 1 for stream in sharing}
-    return [
-        rrb.Spatial2DView(
-            origin=spec.path, name=f"{spec.stream}: {spec.title}" if spec.stream in ambiguous else spec.title
-        )
-        for spec in specs
-    ]
+    views: list[rrb.View] = []
+    for spec in specs:
+        title = f"{spec.stream}: {spec.title}" if spec.stream in ambiguous else spec.title
+        ranges = {f"{axis}_range": (0.0, side) for axis, side in zip("xy", spec.size, strict=False)}
+        bounds = rrb.VisualBounds2D(**ranges) if ranges else None
+        views.append(rrb.Spatial2DView(origin=spec.path, name=title, visual_bounds=bounds))
+    return views
 
 
 def _images(drawn: Specs) -> _Part | None:

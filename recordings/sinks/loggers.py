@@ -85,10 +85,9 @@ def log_stereo(canvas: Canvas, stream: str, frame: StereoFrame) -> None:
         return
     images = colormaps.top_eight_bits(frame.left, frame.right)
     for side, panel, pixels in zip(("left", "right"), panels, images, strict=True):
-        width = canvas.width(stream)
-        canvas.log_image(
-            f"{stream}/{side}", colormaps.shrunk(pixels, width), ViewSpec(panel, stream, side, f"{stream}: {side}")
-        )
+        shown = colormaps.shrunk(pixels, canvas.width(stream))
+        view = ViewSpec(panel, stream, side, f"{stream}: {side}", size=shown.shape[1::-1])
+        canvas.log_image(view.path, shown, view)
 
 
 @logger_for(Disparity)

@@ -68,6 +68,13 @@ def test_the_names_of_curves_stand_beside_a_plot_and_hide_none(rrd):
     assert rows(rrd, "/curves/ANGLE", "Points2D:colors")[-1][2][:2] == colors
 
 
+def test_a_camera_image_stays_in_its_place_whatever_hazards_are_drawn_over_it(rrd):
+    shown = {view.name: view for view in views(read_layout(rrd).blueprint().root_container)}
+    for side in ("left", "right"):
+        bounds = shown[f"rectified: {side}"].properties["VisualBounds2D"].range.as_arrow_array().to_pylist()
+        assert bounds == [{"x_range": [0.0, 64.0], "y_range": [0.0, 48.0]}]
+
+
 def test_the_command_line_names_the_desks_in_their_order():
     assert tuple(DESKS) == NAMES
 
