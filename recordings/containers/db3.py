@@ -5,6 +5,7 @@ Messages are fetched one by one, so memory does not depend on the size of the fi
 
 from __future__ import annotations
 
+import shlex
 import sqlite3
 from array import array
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import HEAD_BYTES, MAX_STORED_BYTES
 
 _ROWS_AT_ONCE = 1000
+_CHECKPOINT = "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('PRAGMA wal_checkpoint')"
 
 
 class Db3File:
@@ -45,9 +47,10 @@ class Db3File:
             times = self.timeline.log_times[self.timeline.log_times >= 0]
             if not times.size:
                 damage = f" that can be read: {self.lost[0].reason}" if self.lost else "; record it again"
-                raise LogError(f"{path} contains no messages{damage}")
+                raise LogError(f"{path} contains no messages{self._unwritten or damage}")
             self.start, self.end = int(np.min(times)), int(np.max(times))
-            self._note_unwritten()
+            if self._unwritten:
+                self.lost.append(LostMessage(None, self.end, self._unwritten.removeprefix("; ")))
         except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:  # a column may have any type
             self.close()
             raise LogError(f"{path} is no rosbag2 recording or is damaged ({sentence_of(error)})") from error
@@ -107,7 +110,9 @@ class Db3File:
     def _read_channels(self) -> dict[int, Channel]:
         tables = {name for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
-            raise LogError(f"{self.path} is an SQLite file, but no rosbag2 recording: it has no table of messages")
+            raise LogError(
+                f"{self.path} is an SQLite file, but no rosbag2 recording: it has no table of messages{self._unwritten}"
+            )
         schemas = dict[str, MessageSchema]()
         if "message_definitions" in tables:  # from ROS 2 Iron on
             columns = "topic_type, encoding, encoded_message_definition"
@@ -162,13 +167,14 @@ class Db3File:
         except (sqlite3.Error, ValueError, OverflowError) as error:
             return f"row {row} of the file is broken ({sentence_of(error)})"
 
-    def _note_unwritten(self) -> None:
-        """Note the messages that a stopped recorder left in a file of its own."""
+    @cached_property
+    def _unwritten(self) -> str:
+        """The end of a sentence, if a stopped recorder left messages in a file of its own; else empty."""
         waiting = self.path.with_name(f"{self.path.name}-wal")
-        if waiting.exists() and waiting.stat().st_size:
-            remedy = f"`sqlite3 {self.path.name} 'PRAGMA wal_checkpoint'` adds them"
-            reason = f"the recorder was stopped and {waiting.name} has messages that are not read; {remedy}"
-            self.lost.append(LostMessage(None, self.end, reason))
+        if not (waiting.exists() and waiting.stat().st_size):
+            return ""
+        command = f'python3 -c "{_CHECKPOINT}" {shlex.quote(str(self.path))}'
+        return f"; the recorder was stopped and {waiting.name} has messages that are not read; `{command}` adds them"
 
 
 def _bytes(value: object) -> bytes:

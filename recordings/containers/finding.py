@@ -7,6 +7,7 @@ NAME_0, NAME_1 and so on. Nothing is imported that takes time, so a wrong name i
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,9 +45,8 @@ def find_files(given: Path | Sequence[Path]) -> FoundFiles:
         if path.name == METADATA:
             raise LogError(f"{path} only describes a recording; give its folder {path.absolute().parent}")
         if path.name.endswith(ZSTD_SUFFIXES) and path.is_file():
-            raise LogError(
-                f"{path} is compressed as a whole; give the folder of the recording, or unpack it: zstd -d {path.name}"
-            )
+            remedy = f"give the folder of the recording, or unpack it by `zstd -d {shlex.quote(str(path))}`"
+            raise LogError(f"{path} is compressed as a whole; {remedy}")
     files = [file for path in paths for file in (folders[path].files if path in folders else [path])]
     missing = [sentence for folder in folders.values() for sentence in folder.missing]
     return FoundFiles(files, missing, _split_of(files[0]) if len(files) == 1 and named else "")

@@ -1,6 +1,9 @@
 """rosbag2 databases and ROS 1 bags, sound and damaged: what can be read is read, the rest is reported."""
 
+import shlex
 import sqlite3
+import subprocess
+import sys
 
 import pytest
 from rosbags.rosbag1 import Writer as Bag1Writer
@@ -82,7 +85,30 @@ def test_messages_of_an_unknown_topic_and_in_a_journal_are_reported(database):
     database.with_name(f"{database.name}-wal").write_bytes(b"journal")
     _, lost = read(database)
     assert lost[0] == "1 message of topic 99 cannot be read: the file does not define it"
-    assert lost[1].startswith("the recorder was stopped and bag_0.db3-wal has messages that are not read; `sqlite3 ")
+    assert lost[1].startswith("the recorder was stopped and bag_0.db3-wal has messages that are not read; `python3 -c ")
+
+
+@pytest.mark.parametrize("tables_too", [False, True])
+def test_the_advice_for_a_stopped_recorder_adds_its_messages(database, tmp_path, tables_too):
+    sound, _ = read(database)
+    path, opened = tmp_path / "stopped.db3", sqlite3.connect(tmp_path / "running.db3", isolation_level=None)
+    opened.execute("PRAGMA journal_mode = WAL")
+    opened.execute("ATTACH ? AS whole", (str(database),))
+    for (statement,) in opened.execute("SELECT sql FROM whole.sqlite_master WHERE type = 'table'").fetchall():
+        opened.execute(statement)
+    opened.execute("INSERT INTO topics SELECT * FROM whole.topics")
+    if not tables_too:
+        opened.execute("PRAGMA wal_checkpoint")
+    opened.execute("INSERT INTO messages SELECT * FROM whole.messages")
+    for ending in ("", "-wal"):  # as a stopped recorder leaves them
+        path.with_name(f"{path.name}{ending}").write_bytes((tmp_path / f"running.db3{ending}").read_bytes())
+    opened.close()
+    with pytest.raises(LogError, match=r"the recorder was stopped and stopped\.db3-wal has messages") as refused:
+        open_recording(path)
+    python, *rest = shlex.split(str(refused.value).split("`")[1])
+    assert python == "python3"
+    subprocess.run([sys.executable, *rest], check=True)
+    assert read(path) == (sound, [])
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,8 @@
 """Several files are one log: the same messages as from one file, whatever the container."""
 
+import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -133,11 +136,20 @@ def test_a_folder_without_one_recording_is_refused(tmp_path, names, sentence):
     assert str(refused.value).startswith(f"{tmp_path} {sentence}")
 
 
-def test_a_compressed_file_alone_is_refused_with_the_remedy(sample, tmp_path):
+def test_a_compressed_file_alone_is_refused_with_the_remedy(sample, whole, tmp_path):
     path = tmp_path / "bag_0.mcap.zstd"
     path.write_bytes(zstandard.compress(sample.read_bytes()))
-    with pytest.raises(LogError, match=r"compressed as a whole; give the folder .* zstd -d bag_0\.mcap\.zstd"):
+    with pytest.raises(
+        LogError, match=r"compressed as a whole; give the folder of the recording, or unpack"
+    ) as refused:
         open_recording(path)
+    assert items_of(tmp_path) == essences(whole)
+    command = shlex.split(str(refused.value).split("`")[1])
+    assert command == ["zstd", "-d", str(path)]
+    if shutil.which("zstd"):
+        subprocess.run([*command, "-q"], check=True)
+        path.unlink()
+        assert items_of(path.with_suffix("")) == essences(whole)
 
 
 def test_a_bomb_is_not_unpacked(tmp_path):
