@@ -142,7 +142,7 @@ class McapFile:
                 elif log_time >= low:
                     yield item
             if (after := next(following, None)) is not None:
-                heappush(queue, first._replace(log_time=after[0], place=after[1], item=after[2], following=following))
+                heappush(queue, _Queued(after[0], first.offset, after[1], after[2], following))
         if start is None and end is None and places is None:
             yield from self._unaccounted(found)
 

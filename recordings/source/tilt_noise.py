@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from stages.data import Tilt
 
@@ -36,7 +36,7 @@ class TiltNoise:
             return tilt
         kept = sorted(self.squares)[: max(int(KEPT_SHARE * len(self.squares)), 1)]
         shown = math.sqrt(sum(kept) / len(kept) / KEPT_MEAN / 2)
-        return replace(tilt, sigma=max(shown, tilt.sigma or 0.0))
+        return tilt.with_sigma(max(shown, tilt.sigma or 0.0))
 
     def _compare(self) -> None:
         """Add the residual of the last reading but one."""

@@ -47,8 +47,10 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
     values = np.array(getattr(owner, name), dtype=np.float64)
     if finite and not np.isfinite(values).all():
         raise StageError(f"{type(owner).__name__}.{name} must be finite, not {values.tolist()}")
-    object.__setattr__(owner, name, values)
-    publish(owner, name, shape, np.float64)
+    if values.shape != shape:
+        wanted = ", ".join(map(str, shape))
+        raise StageError(f"{type(owner).__name__}.{name} must have shape ({wanted}), not {values.shape}")
+    object.__setattr__(owner, name, read_only(values))
 
 
 def publish_stamp(owner: Any) -> None:

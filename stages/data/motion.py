@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,6 +92,12 @@ class Tilt:
             raise StageError(f"Tilt.sigma must be at least 0 and finite, not {self.sigma}")
         if not abs(math.hypot(*self.up) - 1.0) < 1e-6:
             raise StageError(f"Tilt.up must be a unit vector, not {self.up.tolist()}")
+
+    def with_sigma(self, sigma: float) -> Tilt:
+        """The same direction with another sigma, rad. It is not checked again: an Imu gives hundreds per second."""
+        made = copy(self)
+        object.__setattr__(made, "sigma", sigma)
+        return made
 
     def interpolated(self, later: Tilt, stamp: int) -> Tilt:
         """The tilt at `stamp`, ns, between this one and a later one, along the great circle."""
