@@ -34,6 +34,8 @@ VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
     cv2.COLORMAP_INFERNO: rr.components.Colormap.Inferno,
 }
 LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, share of the picture's height
+ROW_BESIDE = 0.27  # least height of a row of a legend beside the picture, share of the picture's height
+MAX_UNIT_CHARS = 3  # of a unit that stands at each value of a scale; a longer one stands at the last
 HEADROOM = 0.35  # above the first row of a legend, share of the height of a row
 
 
@@ -325,7 +327,8 @@ def _scale(
     """Three values of a colour map, with their colours; the middle one is the limit of hazards, if there is one."""
     values = np.array([low, (low + high) / 2 if hazard is None else hazard, high])
     colors = [(int(r), int(g), int(b)) for r, g, b in colormaps.apply_palette(values, low, high, palette)]
-    names = [f"{colormaps.format_value(value)} {unit}".rstrip() for value in values]
+    units = [unit] * 3 if len(unit) <= MAX_UNIT_CHARS else ["", "", unit]
+    names = [f"{colormaps.format_value(value)} {end}".rstrip() for value, end in zip(values, units, strict=True)]
     names[1] = names[1] if hazard is None else f"limit {names[1]}"
     return tuple(zip(names, colors, strict=True))
 
@@ -359,8 +362,9 @@ def _places(
     columns, row_height = -(-count // rows), LEGEND_ROW[rows > 1] * height
     places = [divmod(number, columns) for number in range(count)]
     if beside:
-        dots = [((1.1 + 0.7 * column) * width, (row + 0.5) * height / rows) for row, column in places]
+        pitch = max(1 / rows, ROW_BESIDE) * height
+        dots = [((1.1 + 0.7 * column) * width, height / 2 + (row + (1 - rows) / 2) * pitch) for row, column in places]
         # A label is centred below its pin.
-        return dots, [(x + 0.33 * width, y - 0.45 * height / rows) for x, y in dots], rows, row_height
+        return dots, [(x + 0.33 * width, y - 0.45 * pitch) for x, y in dots], rows, row_height
     dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
     return dots, dots, rows, row_height
