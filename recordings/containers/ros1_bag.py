@@ -1,4 +1,4 @@
-"""Reads a ROS 1 bag (.bag, version 2.0). The index is read by rosbags, the chunks here.
+"""Reads a ROS 1 bag (.bag, version 2.0). The connections are read by rosbags, the index and the chunks here.
 
 A chunk is unpacked when its first message is due and dropped after its last one, so memory holds only chunks that
 overlap in time. A broken chunk loses its own messages.
@@ -7,7 +7,6 @@ overlap in time. A broken chunk loses its own messages.
 from __future__ import annotations
 
 import bz2
-from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
 from io import BytesIO
@@ -15,42 +14,52 @@ from pathlib import Path
 
 import lz4.frame
 import numpy as np
-from rosbags.rosbag1 import Reader, ReaderError
+from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressors, read_bytes, read_uint32
 
+from flow.contracts import counted
+from recordings.containers.bag_index import BagIndex
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import Timeline
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, Unpacking, max_unpacked
 from recordings.mcap.message_order import MAX_OPEN_BYTES
 
-_REINDEX = "`rosbag reindex` repairs a bag whose recorder was stopped"
+_ROWS_AT_ONCE = 10_000
 
 
 class Ros1Bag:
-    """A ROS 1 bag open for reading. Raises LogError for a bag without an index or without messages."""
+    """A ROS 1 bag open for reading, also without an index. Raises LogError for a bag without readable messages."""
 
     profile = "ros1"
-    indexed = True
 
     def __init__(self, path: Path) -> None:
         self.path, self.size = path, path.stat().st_size
         self.lost: list[LostMessage] = []
-        self._bag, self._unpacking = Reader(path), Unpacking()
+        self._bag, self._unpacking = BagIndex(path), Unpacking()
+        self.indexed, lost = True, list[str]()
         try:
             self._bag.open()
         except Exception as error:  # foreign bytes may fail the reader in any way
-            raise LogError(f"{path} cannot be read ({sentence_of(error).rstrip('.')}); {_REINDEX}") from error
+            self.indexed = False
+            self._bag = BagIndex(path)
+            lost = self._bag.walk(self._unpacked)
+            if not len(self._bag):
+                self.close()
+                why = f"cannot be read ({sentence_of(error).rstrip('.')})"
+                raise LogError(f"{path} {why}; record it again, as no chunk of it is whole") from error
         try:
-            self._numbers = {connection.id: number for number, connection in enumerate(self._bag.connections)}
             self.channels = {
                 number: Channel(number, connection.topic, "ros1", _schema(connection))
                 for number, connection in enumerate(self._bag.connections)
             }
+            if unknown := len(self._bag) - len(self.timeline):
+                lost.append(f"{counted(unknown, 'message')} of an undefined connection cannot be read")
             if not len(self.timeline):
                 raise LogError(f"{path} contains no messages; record it again")
             times = self.timeline.log_times
             self.start, self.end = int(np.min(times)), int(np.max(times))
+            self.lost += [LostMessage(None, self.end, why) for why in lost]
         except BaseException:
             self.close()
             raise
@@ -58,31 +67,40 @@ class Ros1Bag:
     @cached_property
     def timeline(self) -> Timeline:
         """Channel and log time of every message, in file order."""
-        return Timeline(self._entries[:, 2], self._entries[:, 3])
+        _, channels, entries = self._bag.entries
+        return Timeline(channels, entries["time"])
 
     def messages(
         self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels in log-time order; see `Container`."""
-        kept = range(len(self.timeline)) if places is None else places
-        entries = self._entries[kept.start : kept.stop]
-        times = entries[:, 3]
-        entries = entries[np.isin(entries[:, 2], sorted(channels)) & (times >= (start or 0))]
-        entries = entries[entries[:, 3] < (end if end is not None else 1 << 62)]
-        waiting, chunks = Counter[int](entries[:, 0].tolist()), dict[int, bytes | str]()
-        for chunk, offset, channel, log_time in entries[np.argsort(entries[:, 3], kind="stable")].tolist():
-            if chunk not in chunks:
-                chunks[chunk] = self._unpacked(chunk)
-                while len(chunks) > 1 and sum(map(len, chunks.values())) > MAX_OPEN_BYTES:
-                    del chunks[next(iter(chunks))]  # it is unpacked again when due
-            found = _message_at(chunks[chunk], chunk, offset)
-            if isinstance(found, str):
-                yield LostMessage(channel, log_time, found)
-            else:
-                yield RawMessage(channel, log_time, found)
-            waiting[chunk] -= 1
-            if not waiting[chunk]:
-                chunks.pop(chunk, None)
+        timeline, (of_chunk, _, entries) = self.timeline, self._bag.entries
+        kept = range(len(timeline)) if places is None else places
+        chosen = timeline.places_of(channels)
+        times = timeline.log_times[chosen]
+        inside = (chosen >= kept.start) & (chosen < kept.stop)
+        chosen = chosen[inside & (times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
+        chosen = chosen[np.argsort(timeline.log_times[chosen], kind="stable")]
+        waiting, chunks = np.bincount(of_chunk[chosen], minlength=len(self._bag.places)), dict[int, bytes | str]()
+        for first in range(0, len(chosen), _ROWS_AT_ONCE):
+            block = chosen[first : first + _ROWS_AT_ONCE]
+            columns = of_chunk[block], entries["offset"][block], timeline.channels[block], timeline.log_times[block]
+            for number, offset, channel, log_time in zip(*(column.tolist() for column in columns), strict=True):
+                chunk = self._bag.places[number]
+                if chunk not in chunks:
+                    chunks[chunk] = self._unpacked(chunk)
+                    while len(chunks) > 1 and sum(map(len, chunks.values())) > MAX_OPEN_BYTES:
+                        del chunks[next(iter(chunks))]  # it is unpacked again when due
+                found = _message_at(chunks[chunk], chunk, offset)
+                if isinstance(found, str):
+                    yield LostMessage(channel, log_time, found)
+                else:
+                    yield RawMessage(channel, log_time, found)
+                waiting[number] -= 1
+                if not waiting[number]:
+                    chunks.pop(chunk, None)
+        if end is None and kept.stop >= len(timeline):
+            yield from self.lost
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels; they have to be read as a whole."""
@@ -96,19 +114,6 @@ class Ros1Bag:
         """Close the file."""
         if self._bag.bio is not None:
             self._bag.close()
-
-    @cached_property
-    def _entries(self) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-        """Chunk, offset in it, channel and log time, ns, of every message, in file order."""
-        rows = [
-            (entry.chunk_pos, entry.offset, self._numbers[connection], entry.time)
-            for connection, entries in self._bag.indexes.items()
-            if connection in self._numbers
-            for entry in entries
-        ]
-        self._bag.indexes.clear()
-        found = np.array(rows, np.int64).reshape(-1, 4)
-        return found[np.lexsort((found[:, 1], found[:, 0]))]
 
     def _unpacked(self, position: int) -> bytes | str:
         """The records of a chunk, or why it is broken."""

@@ -30,7 +30,7 @@ from tests.conftest import rewrite
 from tests.fuzz import folders
 from tests.fuzz.mutations import Mutate, mutated_bytes, mutated_messages, mutated_schemas, mutated_text
 from tests.recordings.calibration import test_calibration_files as calibrations
-from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
+from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
 from tests.recordings.encodings.rewritten import WRITERS
 from tests.recordings.sample_log import LAYOUTS, picture, write_sample
 from tests.recordings.video.encoder import Encoder
@@ -147,7 +147,9 @@ def _databases(folder: Path) -> list[bytes]:
 def _bags(folder: Path) -> list[bytes]:
     rows = rows_of(write_sample(folder / "sample.mcap"))
     compressions = (None, BagWriter.CompressionFormat.LZ4, BagWriter.CompressionFormat.BZ2)
-    return [write_bag(rows, folder / f"{number}.bag", kind).read_bytes() for number, kind in enumerate(compressions)]
+    paths = [write_bag(rows, folder / f"{number}.bag", kind) for number, kind in enumerate(compressions)]
+    whole = [path.read_bytes() for path in paths]
+    return whole + [without_index(path).read_bytes() for path in paths]
 
 
 def _images(folder: Path) -> list[bytes]:

@@ -12,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from recordings.containers.container import LostMessage
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
-from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
+from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
 from tests.recordings.sample_log import LEFT
 
 
@@ -165,8 +165,33 @@ def test_a_broken_chunk_of_a_bag_loses_its_messages(sample, tmp_path):
     assert lost[0].startswith("the chunk at byte 4109 is broken and its messages are lost (")
 
 
-def test_a_bag_without_its_index_is_refused_with_the_remedy(sample, tmp_path):
+@pytest.mark.parametrize("compression", [None, *Bag1Writer.CompressionFormat])
+def test_a_bag_of_a_stopped_recorder_is_read_without_its_index(sample, tmp_path, compression):
+    path = write_bag(rows_of(sample), tmp_path / "log.bag", compression)
+    sound, content = read(path), path.read_bytes()
+    index = int.from_bytes(content.partition(b"index_pos=")[2][:8], "little")
+    assert read(without_index(path)) == sound
+    path.write_bytes(content[:index])
+    assert read(path) == sound
+    path.write_bytes(content[:index] + content[4109:][:3000])  # a chunk that is cut
+    kept, lost = read(path)
+    assert kept == sound[0]
+    where = f"at byte {index} of {index + 3000} (no whole record is there)"
+    assert lost == [f"the bag is cut or damaged {where}; before that it contains {len(kept)} messages"]
+
+
+def test_messages_of_an_unknown_connection_of_a_bag_are_reported(sample, tmp_path):
+    path = write_bag(rows_of(sample), tmp_path / "log.bag")
+    sound, content = read(path)[0], path.read_bytes()
+    place = content.index(b"conn=", content.index(b"op=\x02")) + len(b"conn=")  # of the first message
+    path.write_bytes(content[:place] + b"\x63" + content[place + 1 :])
+    kept, lost = read(without_index(path))
+    assert kept == sound[1:]
+    assert lost == ["1 message of an undefined connection cannot be read"]
+
+
+def test_a_bag_without_a_whole_chunk_is_refused(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
     path.write_bytes(path.read_bytes()[:6000])
-    with pytest.raises(LogError, match=r"log\.bag cannot be read \(.*\); `rosbag reindex` repairs a bag"):
+    with pytest.raises(LogError, match=r"log\.bag cannot be read \(.*\); record it again, as no chunk of it is whole"):
         open_recording(path)

@@ -26,7 +26,7 @@ from recordings.ros2.cdr import make
 from tests.conftest import rewrite
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
-from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
+from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
 from tests.recordings.sample_log import LEFT, START, TILT, essence, items_of, write_sample
 
 Extra = Callable[[Writer, dict[str, int]], object]
@@ -134,6 +134,17 @@ def bag(compression: BagWriter.CompressionFormat) -> Callable[[Path], Path]:
     )
 
 
+def bag_in_use(count: int, has_index: bool) -> Callable[[Path], Path]:
+    """The sample as a ROS 1 bag with more messages of the tilt."""
+    more = ((TILT, START + number, NOTHING) for number in range(count))
+
+    def write(folder: Path) -> Path:
+        path = write_bag(rows_of(write_sample(folder / "sample.mcap")), folder / "log.mcap", None, more)
+        return path if has_index else without_index(path)
+
+    return write
+
+
 def database(count: int, data: str, topic: str = LEFT, kind: str = "", apart: int = 1) -> Callable[[Path], Path]:
     """The sample as a database with more messages of a topic. data: in SQL; kind: the type of a new topic;
     apart: ns."""
@@ -219,6 +230,8 @@ LARGE = {
     "6 million messages in use outside chunks": lambda: with_extra(
         lambda *to: many_messages(*to, 6_000_000, TILT), use_chunking=False
     ),
+    "6 million messages in use in a bag": lambda: bag_in_use(6_000_000, has_index=True),
+    "6 million messages in use in a bag without an index": lambda: bag_in_use(6_000_000, has_index=False),
     "6 million messages in use in a database": lambda: database(6_000_000, f"x'{NOTHING.hex()}'", TILT),
 }
 
