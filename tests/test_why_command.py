@@ -67,6 +67,9 @@ def test_the_pixels_of_a_cell_have_the_disparities_of_the_result(traverse, fast_
     found = why(fast_result, AT, cell=(x, y), log=traverse)
     recorded = read_disparity(messages(fast_result, "/nav/disparity")[stamp]).ravel()[found.pixels]
     assert found.pixels.size > 3
+    lowest, next_lowest = found.costs.astype(int)
+    assert found.pixels.size == lowest.size
+    assert np.median(lowest) < 128 < np.median(next_lowest)
     np.testing.assert_allclose(found.disparities, recorded, atol=1 / 64)
     row, col = divmod(int(found.pixels[0]), found.image.shape[1])
     again = why(fast_result, AT, pixel=(col, row), log=traverse)
@@ -96,6 +99,7 @@ def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, s
     assert "\n  drop                     none (only hidden cells have one)\n" in output
     assert re.search(r"\n(free|unknown) with navigation_map\.[a-z_.]+ = ", output)
     assert "\npixels: " in output
+    assert re.search(r"\nsearch: lowest cost \d+ to \d+, median \d+; lead over the next \d+ to \d+, median ", output)
     picture = cv2.imread(str(out)).astype(int)
     assert ((picture[..., 2] > 200) & (picture[..., 1] < 80) & (picture[..., 0] > 150)).sum() > 20
 

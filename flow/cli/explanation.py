@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -94,6 +94,9 @@ class Explanation(CellExplanation):
         The points' pixels, as indices into the flattened left image.
     disparities, sigmas : (N,) ndarray
         Of these pixels, px.
+    costs : (2, N) ndarray
+        The lowest cost of the search at these pixels, and the next lowest, as `Disparity.costs`; no columns if the
+        matcher does not know them.
     sources : dict
         Origin of the disparity -> number of pixels.
     distance : float
@@ -108,6 +111,7 @@ class Explanation(CellExplanation):
     pixels: Array
     disparities: Array
     sigmas: Array
+    costs: Array
     sources: Mapping[str, int]
     distance: float
     tilt: Tilt | None
@@ -187,6 +191,7 @@ def why(
         distance=float(np.median(np.linalg.norm(cloud.points[inside] - origin, axis=1))) if inside.any() else math.nan,
         tilt=_last(items, Tilt),
         image=np.zeros((0, 0), np.uint8) if frame is None else frame.left,
+        costs=_costs(items, cloud.pixel[inside]),
         **_pixels(_last(items, Disparity), cloud.pixel[inside]),
     )
 
@@ -223,6 +228,15 @@ def _pixels(disparity: Disparity | None, pixels: Array) -> dict[str, Any]:
     return found | {"sources": {PixelOrigin(code).name: number for code, number in counts.items()}}
 
 
+def _costs(items: Mapping[str, Any], pixels: Array) -> Array:
+    """The costs of the last search at the size of the last disparity, at some pixels, (2, N); or (2, 0)."""
+    disparities = [item for item in items.values() if isinstance(item, Disparity)]
+    for item in reversed(disparities):
+        if item.costs is not None and item.pixels.size == disparities[-1].pixels.size:
+            return item.costs.reshape(2, -1)[:, pixels]
+    return np.zeros((2, 0), np.uint8)
+
+
 def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
     """Every stream of a graph at the frame of a log nearest to `at`. Raises UsageError if no frame goes through."""
     kept = _Keep()
@@ -243,6 +257,7 @@ class _Keep:
 
     records: list[FrameRecord] = field(default_factory=list)
     suffix = ""
+    asks: ClassVar = {"keep_costs": True}  # of matchers
 
     def wants(self, stream: str, kind: type) -> bool:
         return True

@@ -133,7 +133,20 @@ def _pixel_lines(found: Explanation) -> list[str]:
     return [
         f"pixels: {found.pixels.size} in {extent}; {sources}",
         f"disparity: {low:.2f} to {high:.2f} px{sigma}; {found.distance:.2f} m away",
+        *_cost_lines(found),
     ]
+
+
+def _cost_lines(found: Explanation) -> list[str]:
+    """How bad the best matches are, and how ambiguous."""
+    if not found.costs.size:
+        return []
+    lowest, next_lowest = found.costs.astype(int)
+    cost, lead = (
+        f"{values.min()} to {values.max()}, median {sorted(values)[len(values) // 2]}"
+        for values in (lowest, next_lowest - lowest)
+    )
+    return [f"search: lowest cost {cost}; lead over the next {lead} (0 to 255)"]
 
 
 def _tilt_lines(found: Explanation) -> list[str]:
