@@ -49,6 +49,7 @@ REFUSED = {
     "bare numbers": {"edit": lambda topic, number, message: numbers(message) if topic == TILT else message},
     "two tilts": {"twice": [TILT]},
     "two pairs": {"twice": [f"/stereo/{side}/{kind}" for side in ("left", "right") for kind in CAMERA_TOPICS]},
+    "two calibrations elsewhere": {"moved": ["/stereo/right/camera_info"]},
 }
 
 
@@ -58,13 +59,14 @@ def numbers(message):
     return make("geometry_msgs/msg/Vector3Stamped", header=message.header, vector=vector)
 
 
-def with_copies(log, out, topics):
-    """A log with some topics also below /more."""
+def with_copies(log, out, twice, moved):
+    """A log with some topics also below /more, and others only below /one and /two."""
     with log.open("rb") as stream, out.open("wb") as file:
         writer, channels = Writer(file), {}
         writer.start(profile="ros2")
         for schema, channel, message in make_reader(stream).iter_messages():
-            for topic in [channel.topic] + [f"/more{channel.topic}"] * (channel.topic in topics):
+            folders = ["/one", "/two"] if channel.topic in moved else ["", "/more"] if channel.topic in twice else [""]
+            for topic in (f"{folder}{channel.topic}" for folder in folders):
                 if topic not in channels:
                     known = writer.register_schema(schema.name, schema.encoding, schema.data)
                     channels[topic] = writer.register_channel(topic, "cdr", known)
@@ -84,16 +86,16 @@ KALIBR = {"cam0": CAMERA, "cam1": {**CAMERA, "T_cn_cnm1": RIGHT_FROM_LEFT}}
 @pytest.mark.parametrize("fault", REFUSED)
 def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, tmp_path, capsys):
     changes, file = dict(REFUSED[fault]), tmp_path / "calibration.yaml"
-    twice = changes.pop("twice", [])
-    log = with_copies(write_sample(tmp_path / "sample.mcap", **changes), tmp_path / "log.mcap", twice)
+    copies = [changes.pop(kind, []) for kind in ("twice", "moved")]
+    log = with_copies(write_sample(tmp_path / "sample.mcap", **changes), tmp_path / "log.mcap", *copies)
     file.write_text(json.dumps(KALIBR))  # JSON is YAML
     assert roverflow("info", log) == 2
     offered = capsys.readouterr().out.partition("what would supply it:\n")[2].splitlines()
     commands = {line: shlex.split(line.partition("  (")[0].replace("=FILE", f"={file}")) for line in offered}
     refused = [line for line, changes in commands.items() if roverflow("info", log, *changes) != 0]
-    right_as_left = [line for line in offered if "if /b/picture is the left camera" in line]
+    untrue = "if /b/picture is the left camera", "right_info=/stereo/left"  # conditions that this log does not meet
     assert len(offered) > len(refused)
-    assert refused == right_as_left
+    assert refused == [line for line in offered if any(words in line for words in untrue)]
 
 
 def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_path, capsys):

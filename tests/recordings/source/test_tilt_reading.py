@@ -168,6 +168,20 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
 
     named = written(tmp_path / "three.mcap", drive(seconds=2), second, GYRO)
     assert read(named)[2].count("/camera/gyro/sample") == 1  # the one of the same name
+
+    def unnamed(*sample):
+        found = split(*sample)
+        accelerations = {"/board": found["/camera/accel/sample"]} if "/camera/accel/sample" in found else {}
+        return accelerations | dict.fromkeys(("/one", "/two"), found["/camera/gyro/sample"])
+
+    several = written(tmp_path / "several.mcap", drive(seconds=2), unnamed, GYRO)
+    with McapSource().open(several) as log:
+        assert "rates that may go with the accelerations of /board (/one, /two)" in log.missing["inclinometer"]
+        offered = [remedy.settings for remedy in log.resolution.remedies["inclinometer"]]
+    assert offered == [{"gyroscope": "/one"}, {"gyroscope": "/two"}]
+    for settings in offered:
+        with McapSource(**settings).open(several) as log:
+            assert "inclinometer" in log.topics
     assert "gyroscope' is set to /left/image_rect" in missing(named, McapSource(gyroscope="/left/image_rect"))
 
 

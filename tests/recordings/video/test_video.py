@@ -1,5 +1,8 @@
 """Images from compressed video: what is lost, what is not, and where decoding begins."""
 
+import tomllib
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -87,3 +90,5 @@ def test_video_without_its_library_is_refused_with_the_remedy(sample, tmp_path, 
             opened.missing["left"]
             == f"{LEFT}: compressed video needs PyAV; install it by `pip install 'roverflow[video]'`"
         )
+    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
+    assert [line[:4] for line in project["optional-dependencies"]["video"]] == ["av>="]
