@@ -23,7 +23,7 @@ MAX_HAMMING_BITS = 64  # between the descriptors of a pair, of 256
 MAX_DISTANCE_RATIO = 0.85  # to the next best partner (Lowe, 2004)
 RANSAC_TOLERANCE = 3.0  # px of the detection image, reprojection error of an inlier
 RANSAC_TRIALS = 300
-PATCH = 21  # px, side of the tracked patch
+PATCH = 11  # px, side of the tracked patch; a larger one shows surfaces at several depths
 MAX_PATCH_SHIFT = 6.0  # px, from the patch's position predicted by RANSAC's pose
 MIN_PATCH_SIGMA = 0.05  # px
 FIT_ROUNDS = 8
@@ -128,9 +128,9 @@ def _tracked_step(
     points, start, guess = _predicted(earlier, later, matrix, turn, shift)
     if len(points) < min_features:
         return None
-    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        earlier.gray, later.gray, start, guess.copy(), winSize=(PATCH, PATCH), maxLevel=1, criteria=stop,
+        earlier.gray, later.gray, start, guess.copy(), winSize=(PATCH, PATCH), maxLevel=0, criteria=stop,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     good = (status[:, 0] == 1) & (np.linalg.norm(found - guess, axis=1) < MAX_PATCH_SHIFT)
