@@ -5,8 +5,8 @@ of a depth edge count separately. Pictures of image, disparity, source and confi
 command line.
 """
 
+import argparse
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -375,4 +375,6 @@ def _legend() -> Iterator[str]:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("demo/study"))
+    parser = argparse.ArgumentParser("python -m tests.study", description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("demo/study"), help="of the pictures (demo/study)")
+    main(parser.parse_args().folder)

@@ -111,6 +111,10 @@ class Refine(Stage):
         high=16,
     )  # fmt: skip
     support: bool = parameter(True, "whether matches of weak texture move to the planes of windows that grow")
+    min_support_shift: float = parameter(
+        0.0, "support that moves a match by less is left out, so that the errors of neighbours stay independent; needs "
+        "`support`", unit="px", low=0,
+    )  # fmt: skip
     min_correlation: float = parameter(
         0.4,
         "correlation of the images over a pixel's support below which it becomes FILLED; 0: no test; needs `support`",
@@ -216,6 +220,8 @@ class Refine(Stage):
         consistent = found.sigma <= F32(self.max_sigma)
         if self.min_correlation:
             consistent &= found.correlation >= F32(self.min_correlation)
+        if self.min_support_shift:
+            np.copyto(found.pixels, pixels, where=np.abs(found.pixels - pixels) < F32(self.min_support_shift))
         return found.pixels, found.sigma, consistent
 
     def _sharpened(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:

@@ -341,3 +341,14 @@ def test_a_match_without_correlation_becomes_filled():
     # Nor when brightness has moved it. (In the first columns so little is compared that chance may bear it out.)
     assert (fitted.source[:50, 3:] == PixelOrigin.FILLED).all()
     assert (fitted.source[70:, 15:] == PixelOrigin.MEASURED).all()
+
+
+def test_a_match_near_its_support_stays_as_it_was_matched(box):
+    frame, matches, _ = box
+    plain = BARE | {"support": True, "bilateral_radius": 0, "edge_radius": 0}
+    moved, kept = (Refine(min_support_shift=shift, **plain)(frame, matches).pixels for shift in (0.0, 0.2))
+    shift = np.abs(moved - matches.pixels)
+    near, far = shift < 0.2, shift >= 0.2
+    assert min(near.sum(), far.sum()) > 1000
+    np.testing.assert_array_equal(kept[near], matches.pixels[near])
+    np.testing.assert_array_equal(kept[~near], moved[~near])
