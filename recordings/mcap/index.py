@@ -38,6 +38,7 @@ RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER_LENGTH = 20
 _MAX_SUMMARY_BYTES = 1 << 30  # of a summary or header that is read
+_UNCHECKED_BYTES = 1 << 16  # that are asked for without a look at the file's size, for speed
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 
 
@@ -188,12 +189,14 @@ def read_summary(file: BinaryIO, size: int) -> Index | None:
 
 
 def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
-    """At most `size` bytes from `offset`; none beyond the end of the file."""
-    there = os.fstat(file.fileno()).st_size - offset
-    if there <= 0:
-        return b""
-    file.seek(offset)
-    return file.read(min(size, there))
+    """At most `size` bytes from `offset`, past the buffer and position of `file`; none beyond its end."""
+    number = file.fileno()
+    if size > _UNCHECKED_BYTES or offset >= 1 << 63:  # damaged ones may be huge
+        size = min(size, max(0, os.fstat(number).st_size - offset))
+    found = os.pread(number, size, offset) if size > 0 else b""
+    while len(found) < size and (more := os.pread(number, size - len(found), offset + len(found))):
+        found += more
+    return found
 
 
 def iter_records(section: bytes | memoryview, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
