@@ -17,7 +17,7 @@ from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.graph import Graph, Node
 from flow.runtime.ledger import Ledger, failure
 
-EXCERPTS = 9  # stretches of the log, one frame from each
+EXCERPTS = 7  # stretches of the log, one frame from each
 
 Sample = dict[str, Any]  # stream -> item, of one frame
 Excerpts = Callable[[int, set[str]], Iterable[Iterable[Event]]]  # (number, source streams) -> stretches of the log
@@ -37,7 +37,7 @@ class Prepass:
 
 
 def prepass(graph: Graph, excerpts: Excerpts) -> Prepass:
-    """Let the surveying stages of a graph see nine frames of the log, and fix them.
+    """Let the surveying stages of a graph see seven frames of the log, and fix them.
 
     A stage surveys if its `surveys` is true. Its `survey` has the ports of `__call__`, and gets a list for each. It
     returns the stage to run and its finding, or None. Raises PipelineError where a survey depends on a stage with

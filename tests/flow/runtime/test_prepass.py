@@ -83,7 +83,7 @@ def test_a_survey_sees_the_first_complete_frame_of_each_excerpt(tmp_path):
     assert sink.values("centred")[1] == pytest.approx(2 - 26 / 3)
     assert (summary["verdict"], summary["frames_in"]) == ("COMPLETE", 8)
     assert 0 < summary["survey_cpu_seconds"] < summary["cpu_seconds"]
-    assert log.asked == [(9, {"left", "right"})]
+    assert log.asked == [(7, {"left", "right"})]
 
 
 def test_a_frame_with_a_failed_stage_is_not_surveyed(tmp_path):
