@@ -1,7 +1,7 @@
 """The index of a ROS 1 bag: where each message is, and its log time.
 
-It is read from the bag's index records, 24 bytes of memory a message. A recorder that was stopped has
-not written all of them; then the chunks are walked through.
+It is read from the bag's index records, 24 bytes of memory a message. A stopped recorder leaves no list of the chunks.
+Then the file is walked through, and every chunk is unpacked once to find its messages.
 """
 
 from __future__ import annotations
@@ -69,7 +69,10 @@ class BagIndex(Reader):
                     raise ReaderError("no whole record is there")
                 if operation == RecordType.CHUNK:
                     self.bio.seek(position)
-                    self.chunks[position] = self.read_chunk()
+                    chunk = self.read_chunk()
+                    if not chunk.datasize:  # a stopped recorder did not state the size of its last chunk
+                        chunk, after = chunk._replace(datasize=size - chunk.datapos), size
+                    self.chunks[position] = chunk
             except Exception as error:  # foreign bytes may fail the reader in any way
                 cut = f"is cut or damaged at byte {position} of {size} ({sentence_of(error).rstrip('.')})"
                 return [*lost, f"the bag {cut}; before that it contains {counted(len(self), 'message')}"]

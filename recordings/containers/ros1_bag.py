@@ -46,8 +46,8 @@ class Ros1Bag:
             lost = self._bag.walk(self._unpacked)
             if not len(self._bag):
                 self.close()
-                why = f"cannot be read ({sentence_of(error).rstrip('.')})"
-                raise LogError(f"{path} {why}; record it again, as no chunk of it is whole") from error
+                why = sentence_of(error).rstrip(".").removesuffix(", reindex before reading")
+                raise LogError(f"{path} cannot be read ({why}); record it again, as it shows no messages") from error
         try:
             self.channels = {
                 number: Channel(number, connection.topic, "ros1", _schema(connection))

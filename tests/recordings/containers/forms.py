@@ -83,7 +83,7 @@ def write_bag(
 
 
 def without_index(bag: Path) -> Path:
-    """A bag as a stopped recorder leaves it, but for the records of the index, which nothing points to."""
+    """A bag whose header does not say where the index is, as a stopped recorder leaves it; all chunks are whole."""
     content = bytearray(bag.read_bytes())
     place = content.index(b"index_pos=") + len(b"index_pos=")
     content[place : place + 8] = bytes(8)

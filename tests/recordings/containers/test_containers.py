@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
 
@@ -180,6 +181,21 @@ def test_a_bag_of_a_stopped_recorder_is_read_without_its_index(sample, tmp_path,
     assert lost == [f"the bag is cut or damaged {where}; before that it contains {len(kept)} messages"]
 
 
+def test_the_last_chunk_of_a_stopped_recorder_has_no_stated_size(sample, tmp_path):
+    path = write_bag(rows_of(sample), tmp_path / "log.bag")
+    sound, content = read(path)[0], bytearray(path.read_bytes())
+    with Reader(path) as bag:
+        place, chunk = max(bag.chunks.items())
+    for name in (content.index(b"size=", place) + len(b"size="), chunk.datapos - 4):
+        content[name : name + 4] = bytes(4)
+    last = content.rindex(b"time=", chunk.datapos, chunk.datapos + chunk.datasize)
+    path.write_bytes(content[: last + 100])
+    kept, lost = read(path)
+    assert kept == sound[:-1]
+    assert len(lost) == 1
+    assert "is broken" in lost[0]
+
+
 def test_messages_of_an_unknown_connection_of_a_bag_are_reported(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
     sound, content = read(path)[0], path.read_bytes()
@@ -190,8 +206,11 @@ def test_messages_of_an_unknown_connection_of_a_bag_are_reported(sample, tmp_pat
     assert lost == ["1 message of an undefined connection cannot be read"]
 
 
-def test_a_bag_without_a_whole_chunk_is_refused(sample, tmp_path):
+def test_a_bag_without_messages_is_refused(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
-    path.write_bytes(path.read_bytes()[:6000])
-    with pytest.raises(LogError, match=r"log\.bag cannot be read \(.*\); record it again, as no chunk of it is whole"):
-        open_recording(path)
+    content = path.read_bytes()
+    why = r"log\.bag cannot be read \(Bag is not indexed\); record it again, as it shows no messages"
+    for size in (4109, 4200):  # after the header, and in the first record of the first chunk
+        path.write_bytes(content[:size])
+        with pytest.raises(LogError, match=why):
+            open_recording(without_index(path))
