@@ -18,7 +18,9 @@ from stages.data import Array, Cell, ElevationMap, NavigationMap
 DISPARITY_LIMIT = 1.0  # px at the ends of the scale
 HEIGHT_LIMIT = 0.05  # m
 _GRID_MAP = "grid_map_msgs/msg/GridMap"
-_LESS, _NONE, _MORE = np.array([[33, 102, 172], [247, 247, 247], [178, 24, 43]], np.float32)
+_LESS, _NONE, _MORE = (33, 102, 172), (247, 247, 247), (178, 24, 43)
+_SHADES = 128  # of blue, and of red
+_COLORS = np.concatenate([np.linspace(_LESS, _NONE, _SHADES + 1), np.linspace(_NONE, _MORE, _SHADES + 1)[1:]])
 ONLY_ONE = {1: ("only in A", (120, 90, 160)), 2: ("not in A", (70, 150, 110))}
 FLIPS = {
     0: ("same", (225, 225, 222)),
@@ -55,10 +57,10 @@ def error_page(estimate: Array, truth: Array) -> bytes | None:
 
 def signed_colors(change: Array, limit: float) -> Array:
     """Changes, any shape (..., ), as RGB: blue is less, red is more; NaN is `colormaps.UNKNOWN_RGB`."""
-    share = np.clip(np.nan_to_num(change) / limit, -1.0, 1.0)[..., None]
-    rgb = _NONE + np.where(share < 0, -share * (_LESS - _NONE), share * (_MORE - _NONE))
+    known = np.nan_to_num(change * (_SHADES / limit))
+    rgb = _COLORS.astype(np.uint8).take(np.rint(np.clip(known, -_SHADES, _SHADES)).astype(np.intp) + _SHADES, axis=0)
     rgb[np.isnan(change)] = colormaps.UNKNOWN_RGB
-    return np.asarray(rgb + 0.5, np.uint8)
+    return rgb
 
 
 def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array] | None:
