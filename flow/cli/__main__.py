@@ -28,7 +28,7 @@ def program() -> int:
     except KeyboardInterrupt:
         print("roverflow: interrupted", file=sys.stderr)
         code = INTERRUPTED
-    gc.freeze()  # the end of the process frees all memory; the interpreter's last collection would take 0.3 s
+    gc.freeze()  # the end of the process frees all memory, so the interpreter's last collection is wasted time
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, lambda *_: os._exit(code))

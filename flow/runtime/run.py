@@ -196,25 +196,24 @@ def fitted(graph: Graph, log: Log) -> Graph:
 
 def asked(graph: Graph, outputs: Mapping[str, Path]) -> Graph:
     """The graph whose stages make what its sinks ask for."""
-    asks = [item for use, sink in graph.sinks if use in outputs for item in getattr(sink, "asks", {}).items()]
-    nodes = list(graph.nodes)
-    for i, node in enumerate(nodes):
-        for name, value in asks:
-            default = getattr(type(node.actor), name, None)
-            if not node.aligns and default is not None and getattr(node.actor, name) == default:
-                nodes[i] = node = replace(node, actor=replace(node.actor, **{name: value}))
-    return replace(graph, nodes=tuple(nodes))
+    for use, sink in graph.sinks:
+        for name, value in getattr(sink, "asks", {}).items() if use in outputs else ():
+            graph = _with_default(graph, name, value)
+    return graph
 
 
 def with_spare_threads(graph: Graph, frames: int | None, workers: int) -> Graph:
     """The graph for a run of fewer frames than workers: a stage with `threads` at its default uses two for a frame."""
-    if frames is None or 2 * max(frames, 1) > workers:
-        return graph
+    return graph if frames is None or 2 * max(frames, 1) > workers else _with_default(graph, "threads", 2)
+
+
+def _with_default(graph: Graph, name: str, value: Any) -> Graph:
+    """The graph with another value of a parameter in all stages that have it at its default."""
     nodes = {node.name: node for node in graph.nodes}
     for node in graph.stages:
-        default = getattr(type(node.actor), "threads", None)
-        if default == 1 and node.actor.threads == default:
-            nodes[node.name] = replace(node, actor=replace(node.actor, threads=2))
+        default = getattr(type(node.actor), name, None)
+        if default is not None and getattr(node.actor, name) == default:
+            nodes[node.name] = replace(node, actor=replace(node.actor, **{name: value}))
     return replace(graph, nodes=tuple(nodes.values()))
 
 

@@ -191,7 +191,7 @@ def read_summary(file: BinaryIO, size: int) -> Index | None:
 def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
     """At most `size` bytes from `offset`, past the buffer and position of `file`; none beyond its end."""
     number = file.fileno()
-    if size > _UNCHECKED_BYTES or offset >= 1 << 63:  # damaged ones may be huge
+    if size > _UNCHECKED_BYTES or offset >= 1 << 62:  # damaged ones may be huge
         size = min(size, max(0, os.fstat(number).st_size - offset))
     found = os.pread(number, size, offset) if size > 0 else b""
     while len(found) < size and (more := os.pread(number, size - len(found), offset + len(found))):

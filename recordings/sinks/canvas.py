@@ -193,11 +193,11 @@ class Canvas:
             colormap=VIEWER_COLORMAPS[palette], depth_range=(0.0, limit * per_unit),
         )  # fmt: skip
         name, faint = veiled
-        if faint is not None and (faint.any() or name in self._veiled):
-            self._veiled.add(name)
+        if faint is not None and (faint.any() or view.path in self._veiled):
+            self._veiled.add(view.path)
             mask = _raw(rr.SegmentationImage, np.ascontiguousarray(faint).view(np.uint8))
             self._log(f"{view.path}/{name}", rr.SegmentationImage, [*mask, *_masking(name, VEIL)])
-        entries = [(name, VEIL[:3])] if name in self._veiled and faint is not None else []
+        entries = [(name, VEIL[:3])] if view.path in self._veiled and faint is not None else []
         self.log_legend(f"{view.path}/scale", steps.shape, [*_scale(0.0, limit, unit, palette), *entries])
 
     def log_labels(

@@ -1,8 +1,8 @@
 """Compares the steps of the logged pose with those of visual odometry.
 
 Neither is exact: wheels slip, and visual odometry drifts. But a pose that stands still while the images move, that has
-a wrong heading, or that jumps, differs by as much as the steps themselves. If most steps are
-longer in the images, the scale of the stereo camera or of the odometry is wrong; wheels that slip make them shorter.
+a wrong heading, or that jumps, differs by as much as the steps themselves. If most steps are longer by the images, the
+scale of the stereo camera or of the odometry is wrong. Slip does the opposite: then the logged steps are longer.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from stages.data import Array, CameraMotion, Mount, Pose, Transform
 MIN_STEPS = 5
 MIN_STEP = 0.02  # m; shorter steps are mostly noise
 MAX_DIFFERENCE_SHARE = 0.3  # of a step
-MAX_SCALE_ERROR = 0.05  # by which three of four steps, of so many at least, may be longer in the images
-MIN_SCALED_STEPS = 10
+MAX_SCALE_ERROR = 0.05  # share by which three of four steps may be longer by the images than in the log
+MIN_SCALED_STEPS = 10  # for a comparison of the scales
 MIN_JUMP = 0.5  # m, and
 MIN_JUMP_RATIO = 10.0  # over the median difference
 

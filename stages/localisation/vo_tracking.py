@@ -66,7 +66,7 @@ def vo_frame(frame: StereoFrame, disparity: Disparity) -> VoFrame:
     shrink = max(1, round(image.shape[1] / DETECTION_WIDTH))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else image
     empty = VoFrame(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
-    if min(small.shape) < PATCH:  # OpenCV's detector fails on smaller images
+    if min(small.shape) < PATCH:  # no patch fits; OpenCV's detector fails on images of 1 px
         return empty
     found, descriptors = cv2.ORB.create(MAX_FEATURES, scaleFactor=1.3, nlevels=5, fastThreshold=5).detectAndCompute(
         small, None

@@ -38,4 +38,4 @@ class LeftRightCheck(Stage):
         pixels, source, confidence = drop_inconsistent(
             found, right, self.lr_tolerance, self.disparities or math.inf, self.threads
         )
-        return replace(disparity, pixels=pixels, source=source, confidence=confidence)
+        return replace(disparity, pixels=pixels, source=source, confidence=confidence, costs=None)

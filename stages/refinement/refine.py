@@ -112,8 +112,8 @@ class Refine(Stage):
     )  # fmt: skip
     support: bool = parameter(True, "whether matches of weak texture move to the planes of windows that grow")
     min_support_shift: float = parameter(
-        0.0, "support that moves a match by less is left out, so that the errors of neighbours stay independent; needs "
-        "`support`", unit="px", low=0,
+        0.0, "for a guide: support that moves a match by less is left out, so that the errors of neighbours stay "
+        "independent; sigma stays that of the support; needs `support`", unit="px", low=0,
     )  # fmt: skip
     min_correlation: float = parameter(
         0.4,

@@ -6,9 +6,9 @@ Vulkan driver (Mesa's lavapipe will do).
 
 from __future__ import annotations
 
+import argparse
 import os
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -27,7 +27,7 @@ from tests.walks import FAULTS, SIMULATION
 
 MENU = 36  # px, of the viewer's own bar at the top
 PANELS = (201, 201, 300)  # px, of its own panels below, at the left and at the right, which desks hide
-LATEST = 300  # s
+MAX_WAIT = 300  # s, for a viewer or a picture
 
 
 class Screen(NamedTuple):
@@ -100,7 +100,7 @@ def shot(files: Sequence[Path], at: float, size: tuple[int, int]) -> Array:
             line = next(each for each in recording.timelines if each.name == recording.current_timeline)
             stamp = line.start + round(at * (line.end - line.start))
             client.set_time(line.name, timestamp=np.datetime64(stamp, "ns"), play_state="paused")
-            before, now, end = b"", b" ", time.monotonic() + LATEST
+            before, now, end = b"", b" ", time.monotonic() + MAX_WAIT
             while before != now or client.get_state().loading:
                 if time.monotonic() > end:
                     raise TimeoutError(f"the picture of {files[0]} does not come to rest")
@@ -112,7 +112,7 @@ def shot(files: Sequence[Path], at: float, size: tuple[int, int]) -> Array:
 
 def _connected(port: int) -> ViewerClient:
     """A client of the viewer at a port of loopback, once its files are open."""
-    end = time.monotonic() + LATEST
+    end = time.monotonic() + MAX_WAIT
     while time.monotonic() < end:
         time.sleep(0.2)
         try:
@@ -126,4 +126,11 @@ def _connected(port: int) -> ViewerClient:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path("docs"), sys.argv[2:])
+    parser = argparse.ArgumentParser("python -m tests.docs.screens", description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=Path("docs"), help="of the pictures (docs)")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(SCREENS))
+    given = parser.parse_args()
+    if unknown := set(given.names) - SCREENS.keys():
+        parser.error(f"no picture is called {', '.join(sorted(unknown))}")
+    given.folder.mkdir(parents=True, exist_ok=True)
+    main(given.folder, given.names)
