@@ -73,13 +73,8 @@ class Db3File:
         self, channels: set[int], start: int | None, end: int | None, places: range | None, size: int
     ) -> Iterator[RawMessage | LostMessage]:
         """The first `size` bytes of messages; the rest as in `messages`."""
-        timeline, kept = self.timeline, range(len(self.timeline)) if places is None else places
-        chosen = timeline.places_of(channels)
-        times = timeline.log_times[chosen]
-        inside = (chosen >= kept.start) & (chosen < kept.stop)
-        chosen = chosen[inside & (times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
-        chosen = chosen[np.argsort(timeline.log_times[chosen], kind="stable")]
-        del times, inside  # there may be millions
+        timeline = self.timeline
+        chosen = timeline.chosen(channels, start, end, places)
         for first in range(0, len(chosen), _ROWS_AT_ONCE):
             block = chosen[first : first + _ROWS_AT_ONCE]
             columns = (column[block].tolist() for column in (timeline.channels, timeline.log_times, self._rows[0]))
@@ -89,7 +84,7 @@ class Db3File:
                     yield LostMessage(channel, log_time, data)
                 else:
                     yield RawMessage(channel, log_time, data)
-        if end is None and kept.stop >= len(timeline):
+        if end is None and (places is None or places.stop >= len(timeline)):
             damaged = np.isin(timeline.channels, sorted(channels)) & (timeline.log_times < 0)
             for channel in timeline.channels[damaged].tolist():
                 yield LostMessage(channel, self.end, "the message is lost: its log time is damaged")

@@ -75,12 +75,7 @@ class Ros1Bag:
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels in log-time order; see `Container`."""
         timeline, (of_chunk, _, entries) = self.timeline, self._bag.entries
-        kept = range(len(timeline)) if places is None else places
-        chosen = timeline.places_of(channels)
-        times = timeline.log_times[chosen]
-        inside = (chosen >= kept.start) & (chosen < kept.stop)
-        chosen = chosen[inside & (times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
-        chosen = chosen[np.argsort(timeline.log_times[chosen], kind="stable")]
+        chosen = timeline.chosen(channels, start, end, places)
         waiting, chunks = np.bincount(of_chunk[chosen], minlength=len(self._bag.places)), dict[int, bytes | str]()
         for first in range(0, len(chosen), _ROWS_AT_ONCE):
             block = chosen[first : first + _ROWS_AT_ONCE]
@@ -99,7 +94,7 @@ class Ros1Bag:
                 waiting[number] -= 1
                 if not waiting[number]:
                     chunks.pop(chunk, None)
-        if end is None and kept.stop >= len(timeline):
+        if end is None and (places is None or places.stop >= len(timeline)):
             yield from self.lost
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:

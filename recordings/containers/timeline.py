@@ -61,3 +61,15 @@ class Timeline:
         """The sorted places of the messages of some channels with a valid log time."""
         places = [self.by_channel[channel] for channel in sorted(channels & self.by_channel.keys())]
         return np.sort(np.concatenate([np.zeros(0, np.int64), *places]))
+
+    def chosen(self, channels: set[int], start: int | None, end: int | None, places: range | None) -> Places:
+        """The places of the messages of some channels with start <= log time < end, ns, by log time.
+
+        places: those that count; None: all.
+        """
+        found = self.places_of(channels)
+        if places is not None:
+            found = found[slice(*np.searchsorted(found, [places.start, places.stop]))]
+        times = self.log_times[found]
+        found = found[(times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
+        return found[np.argsort(self.log_times[found], kind="stable")]

@@ -211,7 +211,7 @@ def cluster(address: str | None, processes: int, cores: int, memory: str, dashbo
         with client:
             yield client
         return
-    # A worker that an interrupt ends leaves semaphores, of which multiprocessing would warn.
+    # An interrupted worker leaves semaphores behind, and multiprocessing would warn of them.
     os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
     settings = {"n_workers": processes, "threads_per_worker": 1, "processes": True, "memory_limit": memory}
     shown = {"dashboard_address": f"127.0.0.1:{8787 if dashboard else 0}", "scheduler_kwargs": {"dashboard": dashboard}}
