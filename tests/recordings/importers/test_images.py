@@ -1,6 +1,5 @@
 """Image files become a rover log with the given camera attitude."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,8 @@ from recordings.importers import files
 from recordings.importers.images import import_images
 from recordings.importers.pairing import pair_images
 from recordings.source.transforms import BODY_FROM_OPTICAL
-from tests.conftest import edit_of, rewrite, roverflow
-from tests.recordings.importers.simulated import EXACT, assert_same, assert_same_maps, own_log, seen_in, write_images
+from tests.conftest import roverflow
+from tests.recordings.importers.simulated import EXACT, assert_same, own_log, seen_in, write_images
 from tests.recordings.sample_log import data_folder, picture
 
 CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
@@ -265,27 +264,6 @@ def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
         assert frame.stamp == stamp
         np.testing.assert_allclose(frame.mount.rotation, body @ BODY_FROM_OPTICAL, atol=1e-9)
         np.testing.assert_allclose(frame.mount.translation, [0, 0, 0.9])
-
-
-@pytest.mark.slow
-def test_pairs_of_images_give_the_simulators_maps(tmp_path):
-    level = replace(EXACT, slope=0.0)
-    write_images(level, lambda number, side: tmp_path / "pairs" / side / f"{number}.png")
-    rows = [f"{number},{level.stamp(number)},15\n" for number in range(level.frames)]
-    (tmp_path / "attitudes.csv").write_text("name,stamp,pitch_down\n" + "".join(rows))
-    camera = {name: getattr(level.camera, name) for name in ("fx", "cx", "cy", "baseline")}
-    (tmp_path / "camera.yaml").write_text(yaml.safe_dump(camera))
-    given = "--calibration", tmp_path / "camera.yaml", "--attitudes", tmp_path / "attitudes.csv", "--height", 0.9
-    assert roverflow("import", "images", tmp_path / "pairs", tmp_path / "log.mcap", *given) == 0
-
-    def below_the_camera(_, message):
-        for placed in message.transforms:
-            placed.transform.translation.x -= 0.35
-            placed.transform.translation.y -= 0.12
-
-    change = edit_of("/tf_static", "tf2_msgs/msg/TFMessage", below_the_camera)
-    own = rewrite(own_log(level, tmp_path / "simulated.mcap"), tmp_path / "own.mcap", change)
-    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from tests.recordings.importers.simulated import (
     EXACT,
     RIG,
     assert_same,
-    assert_same_maps,
     assert_same_truth,
     gray,
     numbers,
@@ -134,13 +133,6 @@ def test_a_drive_before_rectification_is_the_simulators_log(tmp_path):
     assert_same(tmp_path / "log.mcap", own)
 
 
-@pytest.mark.slow
-def test_a_drive_gives_the_simulators_maps(tmp_path):
-    folder, own = write_drive(EXACT, tmp_path, ("02", "03")), own_log(EXACT, tmp_path / "own.mcap")
-    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap", "--color") == 0
-    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
-
-
 def test_kittis_own_calibration_has_its_baselines_and_the_cameras_height():
     home = data_folder("kitti")
     values, *others = (_calibration(home / name) for name in CALIBRATIONS)
@@ -172,16 +164,6 @@ def test_an_odometry_sequence_is_the_simulators_log(tmp_path, capsys, keys):
     assert roverflow("import", "kitti", folder, log) == 2
     said = capsys.readouterr().err
     assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in said
-
-
-@pytest.mark.slow
-def test_an_odometry_sequence_gives_the_simulators_maps(tmp_path, monkeypatch):
-    simulation = replace(EXACT, slope=0.0)
-    monkeypatch.setattr("recordings.importers.kitti_odometry.FIRST_STAMP", simulation.start)  # seeds derive from stamps
-    (folder, rig), own = write_sequence(gray(simulation), tmp_path), own_log(gray(simulation), tmp_path / "own.mcap")
-    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig) == 0
-    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
-    assert roverflow("score", tmp_path / "imported-out.mcap", "--truth", tmp_path / "log.mcap") == 0
 
 
 def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, capsys):

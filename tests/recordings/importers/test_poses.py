@@ -15,7 +15,6 @@ from tests.recordings.importers.simulated import (
     EXACT,
     RIG,
     assert_same,
-    assert_same_maps,
     assert_same_truth,
     frames_of,
     numbers,
@@ -81,17 +80,6 @@ def test_a_trajectory_of_tartanair_is_the_simulators_log(tmp_path, capsys, camer
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_a_trajectory_of_tartanair_gives_the_simulators_maps(tmp_path, monkeypatch):
-    still = replace(EXACT, rate=10.0)  # as TartanAir
-    monkeypatch.setattr("recordings.importers.tartanair.FIRST_STAMP", still.start)  # seeds derive from stamps
-    folder, own = write_tartanair(still, tmp_path / "P000"), own_log(still, tmp_path / "own.mcap")
-    assert roverflow("import", "tartanair", folder, tmp_path / "log.mcap", "--rig", folder / "rig.yaml") == 0
-    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
-    scored = tmp_path / "imported-out.mcap", "--truth", tmp_path / "log.mcap"
-    assert roverflow("score", *scored) == 0
-
-
 def test_the_camera_of_tartanair_looks_90_degrees_wide(tmp_path, capsys):
     folder = write_tartanair(EXACT, tmp_path / "P000")
     assert roverflow("import", "tartanair", folder, tmp_path / "log.mcap") == 0
@@ -105,13 +93,6 @@ def test_a_scene_of_lusnar_is_the_simulators_log(tmp_path):
     folder, own = write_lusnar(EXACT, tmp_path / "Moon_1"), own_log(EXACT, tmp_path / "own.mcap")
     assert roverflow("import", "lusnar", folder, tmp_path / "log.mcap", "--rig", folder / "rig.yaml") == 0
     assert_same(tmp_path / "log.mcap", own)
-
-
-@pytest.mark.slow
-def test_a_scene_of_lusnar_gives_the_simulators_maps(tmp_path):
-    folder, own = write_lusnar(EXACT, tmp_path / "Moon_1"), own_log(EXACT, tmp_path / "own.mcap")
-    assert roverflow("import", "lusnar", folder, tmp_path / "log.mcap", "--rig", folder / "rig.yaml") == 0
-    assert_same_maps(tmp_path / "log.mcap", own, tmp_path)
 
 
 @pytest.mark.parametrize(
