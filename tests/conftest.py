@@ -103,15 +103,15 @@ def rewrite(
     *,
     time: Callable[[str, int], int] = lambda topic, log_time: log_time,
     order: Callable[[list[Any]], list[Any]] = list,
-    encode: Callable[[str, int, bytes], tuple[str, bytes]] = lambda topic, index, schema: ("cdr", schema),
+    encode: Callable[[str, int, bytes], tuple[str, bytes]] | None = None,
     silent: bool = False,
     **options: Any,
 ) -> Path:
     """Copy a log message by message, as another kind of MCAP file; options: of mcap.writer.Writer.
 
     change: (topic, index in topic, data) -> the data to write, None to drop it; time: (topic, log time) -> log time;
-    order: changes which message follows which; encode: (topic, index, schema) -> message encoding and schema; silent:
-    whether a topic without messages keeps its channel.
+    order: changes which message follows which; encode: (topic, index, schema) -> another message encoding and
+    schema; silent: whether a topic without messages keeps its channel.
     """
     with source.open("rb") as stream, out.open("wb") as file:
         writer, channels, counts = Writer(file, **options), dict[Any, int](), Counter[str]()
@@ -119,7 +119,8 @@ def rewrite(
         for schema, channel, message in order(list(make_reader(stream).iter_messages())):
             topic, index = channel.topic, counts[channel.topic]
             counts[topic] += 1
-            data, key = change(topic, index, message.data), (topic, *encode(topic, index, schema.data))
+            own = encode(topic, index, schema.data) if encode else (channel.message_encoding, schema.data)
+            data, key = change(topic, index, message.data), (topic, *own)
             if key not in channels and (silent or data is not None):
                 known = writer.register_schema(schema.name, schema.encoding, key[2])
                 channels[key] = writer.register_channel(topic, key[1], known)

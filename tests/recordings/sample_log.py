@@ -1,14 +1,16 @@
 """A small stereo log with asymmetric images, and the same messages in other MCAP layouts."""
 
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, IndexType
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from scipy.spatial.transform import Rotation
 from zstandard import ZstdCompressor
 
@@ -16,7 +18,7 @@ from recordings import McapSource
 from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
-from stages.data import CameraImage, CameraModel, Pose, Tilt, Transform
+from stages.data import CameraModel, Pose, Transform
 
 WIDTH, HEIGHT = 24, 16
 BASELINE = 0.25
@@ -24,6 +26,7 @@ FRAMES = 5
 PERIOD = 100_000_000
 START = 1_700_000_000_000_000_000
 LEFT, RIGHT, TILT = "/stereo/left/image_rect", "/stereo/right/image_rect", "/imu/data"
+UNSTAMPED = {"header.stamp.sec": 0, "header.stamp.nanosec": 0}  # for `changed`
 
 
 def data_folder(name: str) -> Path:
@@ -56,6 +59,7 @@ TRANSFORMS = (
     Transform("base_link", "left_optical", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), [0.5, 0.1, 0.9]),
     Transform("base_link", "imu_link", Rotation.from_euler("z", 90, degrees=True).as_matrix(), [0, 0, 0.4]),
 )
+Event = tuple[int, str, Any]  # log time, stream, item
 Edit = Callable[[str, int, Any], Any]  # (topic, number of the frame, message) -> message, or None to leave it out
 
 LAYOUTS: dict[str, dict[str, Any]] = {
@@ -103,7 +107,7 @@ def write_sample(
     return path
 
 
-def changed(topic: str, values: dict[str, Any], numbers: Collection[int] = range(FRAMES)) -> Edit:
+def changed(topic: str | tuple[str, ...], values: dict[str, Any], numbers: Collection[int] = range(FRAMES)) -> Edit:
     """An edit for `write_sample`: sets fields, by their paths, in messages of topics that end so, in some frames."""
 
     def edit(name: str, number: int, message: Any) -> Any:
@@ -121,9 +125,25 @@ def dropped(*prefixes: str) -> Edit:
     return lambda topic, number, message: None if topic.startswith(prefixes) else message
 
 
-def items_of(path: Path, source: McapSource | None = None, **bounds: float) -> list[tuple[int, str, Any]]:
+def items_of(path: Path | Sequence[Path], source: McapSource | None = None, **bounds: float) -> list[Event]:
     with (source or McapSource()).open(path, **bounds) as log:
         return list(log.events())
+
+
+def with_extra(path: Path, extra: Callable[[Writer, dict[str, int]], object], **options: Any) -> Path:
+    """Write the log with something more. extra: is called with the writer and topic -> channel; options: of Writer."""
+    sample = write_sample(path.with_name("sample.mcap"))
+    with sample.open("rb") as stream, path.open("wb") as out:
+        writer, channels = Writer(out, **options), dict[str, int]()
+        writer.start(profile="ros2")
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
+            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        extra(writer, channels)
+        writer.finish()
+    return path
 
 
 def inventory_of(path: Path, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:
@@ -133,18 +153,17 @@ def inventory_of(path: Path, slop: int = 5_000_000, max_gap: int = 200_000_000) 
 
 
 def essence(item: Any) -> Any:
-    """An item's whole content, comparable."""
-    if isinstance(item, CameraImage):
-        return (
-            item.stamp,
-            item.pixels.tobytes(),
-            item.pixels.shape,
-            item.model.p.tobytes(),
-            item.frame_id,
-            item.rectified,
-        )
-    if isinstance(item, Tilt):
-        return item.stamp, item.up.tobytes(), item.frame_id
-    if isinstance(item, Pose):
-        return item.stamp, item.position.tobytes(), item.quaternion.tobytes(), item.frame_id, item.child_frame_id
-    return item.stamp, item.camera_from_inclinometer.tobytes()
+    """An item's whole content, comparable; an error is itself."""
+    if isinstance(item, np.ndarray):
+        return item.dtype.str, item.shape, item.tobytes()
+    return tuple(essence(getattr(item, field.name)) for field in fields(item)) if is_dataclass(item) else item
+
+
+def essences(events: Iterable[Event]) -> list[Event]:
+    """Events, comparable."""
+    return [(time, stream, essence(item)) for time, stream, item in events]
+
+
+def sound(events: Iterable[Event]) -> list[Event]:
+    """The events that are no losses, comparable."""
+    return essences(event for event in events if not isinstance(event[2], Exception))

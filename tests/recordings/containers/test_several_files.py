@@ -16,20 +16,13 @@ from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from tests.conftest import slow
 from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
-from tests.recordings.sample_log import PERIOD, START, essence, inventory_of
+from tests.recordings.sample_log import PERIOD, START, essences, inventory_of, items_of
 
 PLUGINS = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
 
 
-def items_of(given, **bounds):
-    with McapSource().open(given, **bounds) as log:
-        assert log.missing == {}
-        return [(time, stream, item if isinstance(item, Exception) else essence(item))
-                for time, stream, item in log.events()]  # fmt: skip
-
-
-def essences(events):
-    return [(time, stream, essence(item)) for time, stream, item in events]
+def read(given, **bounds):
+    return essences(items_of(given, **bounds))
 
 
 @pytest.mark.parametrize(("plugin", "mode"), [
@@ -42,27 +35,28 @@ def essences(events):
 ])  # fmt: skip
 def test_a_split_recording_is_the_same_log_as_one_file(sample, whole, tmp_path, plugin, mode):
     folder = write_rosbag2(rows_of(sample), tmp_path / "bag", plugin, 11, mode)
-    assert items_of(folder) == essences(whole)
+    assert read(folder) == essences(whole)
     (folder / "metadata.yaml").write_text("!!timestamp x: 1")  # which the parser fails on
-    assert items_of(folder) == essences(whole)
+    assert read(folder) == essences(whole)
     (folder / "metadata.yaml").unlink()  # as a recorder leaves it that was stopped
-    assert items_of(folder) == essences(whole)
+    assert read(folder) == essences(whole)
     if mode != CompressionMode.FILE:
-        assert set(items_of(sorted(folder.iterdir(), reverse=True))) == set(essences(whole))
+        assert set(read(sorted(folder.iterdir(), reverse=True))) == set(essences(whole))
 
 
 @pytest.mark.parametrize("compression", [None, *Bag1Writer.CompressionFormat])
 def test_a_ros_1_bag_is_the_same_log(sample, whole, tmp_path, compression):
-    assert items_of(write_bag(rows_of(sample), tmp_path / "log.bag", compression)) == essences(whole)
+    assert read(write_bag(rows_of(sample), tmp_path / "log.bag", compression)) == essences(whole)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)
 def test_calibration_and_transforms_before_the_start_are_found_in_other_files(sample, whole, tmp_path, plugin):
     rows = rows_of(sample)
     kept = [row for number, row in enumerate(rows) if not row[0].endswith("camera_info") or number < len(rows) // 5]
-    events = items_of(write_rosbag2(kept, tmp_path / "bag", plugin, 5), start=0.25)
+    events = read(write_rosbag2(kept, tmp_path / "bag", plugin, 5), start=0.25)
     images = [(stream, item) for _, stream, item in events if stream in ("left", "right")]
-    assert images == [(s, essence(i)) for t, s, i in whole if s in ("left", "right") and t > START + 2.5 * PERIOD]
+    expected = [(s, item) for time, s, item in essences(whole) if time > START + 2.5 * PERIOD]
+    assert images == [(stream, item) for stream, item in expected if stream in ("left", "right")]
 
 
 def test_files_of_several_recorders_are_merged_by_log_time(sample, whole, tmp_path):
@@ -71,7 +65,7 @@ def test_files_of_several_recorders_are_merged_by_log_time(sample, whole, tmp_pa
     others = write_rosbag2(
         [row for row in rows if not row[0].startswith("/stereo")], tmp_path / "others", StoragePlugin.SQLITE3
     )
-    found = items_of([others, cameras])
+    found = read([others, cameras])
     assert [time for time, _, _ in found] == [time for time, _, _ in essences(whole)]
     assert sorted(found[1:]) == sorted(essences(whole)[1:])
 
@@ -80,7 +74,7 @@ def test_a_missing_file_of_a_recording_is_in_the_ledger(sample, tmp_path):
     folder = write_rosbag2(rows_of(sample), tmp_path / "bag", parts=3)
     (folder / "bag_1.mcap").unlink()
     sentence = f"bag_1.mcap is missing in {folder}, although metadata.yaml lists it"
-    *_, (_, stream, lost) = items_of(folder)
+    *_, (_, stream, lost) = read(folder)
     assert (stream, str(lost)) == ("log", f"bag: {sentence}")
     assert inventory_of(folder)["damage"] == [sentence]
 
@@ -115,7 +109,7 @@ def test_a_clock_set_back_between_files_is_found(sample, whole, tmp_path):
     for number, part in enumerate([[row for row in rows if row[2] < START + 3 * PERIOD], late]):
         own = write_rosbag2(part, tmp_path / f"part{number}")
         (own / f"part{number}_0.mcap").rename(folder / f"bag_{number}.mcap")
-    assert items_of(folder) == essences(whole)
+    assert read(folder) == essences(whole)
 
 
 @pytest.mark.parametrize(
@@ -143,13 +137,13 @@ def test_a_compressed_file_alone_is_refused_with_the_remedy(sample, whole, tmp_p
         LogError, match=r"compressed as a whole; give the folder of the recording, or unpack"
     ) as refused:
         open_recording(path)
-    assert items_of(tmp_path) == essences(whole)
+    assert read(tmp_path) == essences(whole)
     command = shlex.split(str(refused.value).split("`")[1])
     assert command == ["zstd", "-d", str(path)]
     if shutil.which("zstd"):
         subprocess.run([*command, "-q"], check=True)
         path.unlink()
-        assert items_of(path.with_suffix("")) == essences(whole)
+        assert read(path.with_suffix("")) == essences(whole)
 
 
 def test_a_bomb_is_not_unpacked(tmp_path):
@@ -167,7 +161,7 @@ def test_a_cut_compressed_file_is_read_to_its_end(sample, whole, tmp_path):
     blocks = [packed.compress(block) + packed.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK) for block in
               (content[place : place + 2000] for place in range(0, len(content), 2000))]  # fmt: skip
     file.write_bytes(b"".join(blocks[: len(blocks) // 2]))
-    *events, (_, stream, lost) = items_of(folder)
+    *events, (_, stream, lost) = read(folder)
     assert (stream, type(lost)) == ("log", LogError)
     assert events == essences(whole)[: len(events)]
     assert len(events) > len(whole) // 4

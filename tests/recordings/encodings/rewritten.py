@@ -12,7 +12,6 @@ import numpy as np
 from google.protobuf.json_format import MessageToDict
 from mcap.writer import Writer as McapWriter
 from mcap_protobuf.writer import Writer as ProtobufWriter
-from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.mcap.file import iter_decoded
@@ -48,18 +47,6 @@ def ros1_in_mcap(source: Path, out: Path) -> Path:
             data = bytes(ROS1.serialize_ros1(as_ros1(message), kind))
             writer.add_message(channels[topic], log_time, data, log_time)
         writer.finish()
-    return out
-
-
-def ros1_bag(source: Path, out: Path) -> Path:
-    """A ROS 1 bag."""
-    with BagWriter(out) as writer:
-        connections = dict[str, Any]()
-        for topic, log_time, message in iter_decoded(source):
-            kind = message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
-            writer.write(connections[topic], log_time, ROS1.serialize_ros1(as_ros1(message), kind))
     return out
 
 
@@ -177,7 +164,6 @@ def _renamed(topic: str) -> str:
 
 WRITERS: dict[str, Callable[[Path, Path], Path]] = {
     "ros1.mcap": ros1_in_mcap,
-    "ros1.bag": ros1_bag,
     "protobuf.mcap": protobuf_log,
     "json.mcap": json_log,
 }

@@ -28,6 +28,7 @@ from tests.recordings.sample_log import (
     START,
     TILT,
     TRANSFORMS,
+    UNSTAMPED,
     changed,
     dropped,
     inventory_of,
@@ -128,12 +129,7 @@ def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path):
 
 
 def test_streams_without_stamps_are_noted(tmp_path):
-    def edit(topic, number, message):
-        if topic in (LEFT, "/odom"):
-            message.header.stamp.sec = message.header.stamp.nanosec = 0
-        return message
-
-    described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
+    described = inventory_of(write_sample(tmp_path / "log.mcap", changed((LEFT, "/odom"), UNSTAMPED)))
     assert list(described["notes"]) == ["left", "odometry"]
     assert [line for line in format_description(described).splitlines() if line.startswith("note: ")] == [
         "note: left: the header stamps are 0, so log times are used",
@@ -142,16 +138,9 @@ def test_streams_without_stamps_are_noted(tmp_path):
 
 
 def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
-    def edit(topic, number, message):
-        if topic.endswith("camera_info"):
-            message.width, message.height = 2 * message.width + 12, 2 * message.height
-        return message
-
-    path = write_sample(tmp_path / "log.mcap", edit)
-    assert (
-        "doubtful: cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
-        in (format_description(inventory_of(path)))
-    )
+    path = write_sample(tmp_path / "log.mcap", changed("camera_info", {"width": 60, "height": 32}))
+    doubt = "cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
+    assert f"doubtful: {doubt}" in format_description(inventory_of(path))
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
 from tests.conftest import rewrite
-from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essence, inventory_of, items_of
+from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essences, inventory_of, items_of, sound
 
 
 def record(opcode: int, content: bytes) -> bytes:
@@ -56,9 +56,8 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
             events = list(log.events())
     except LogError as error:
         events = [(0, "log", error)]
-    known = {(time, stream, essence(item)) for time, stream, item in whole if stream != "mount"}
-    good = [(time, stream, essence(item)) for time, stream, item in events
-            if stream != "mount" and not isinstance(item, Exception)]  # fmt: skip
+    known = {event for event in essences(whole) if event[1] != "mount"}
+    good = [event for event in sound(events) if event[1] != "mount"]
     assert set(good) <= known
     assert len(set(good)) == len(good)
     losses = [item for _, _, item in events if isinstance(item, Exception)]
@@ -91,7 +90,7 @@ def test_messages_before_the_cut_in_a_chunk_are_rescued(sample, whole, tmp_path)
     assert "the log is cut or damaged at byte" in str(events[-1][2])
     assert isinstance(events[-1][2], LogError)
     assert sum(stream == "left" for _, stream, _ in events[:-1]) == 3
-    assert [essence(i) for _, _, i in events[:-1]] == [essence(i) for _, _, i in whole[: len(events) - 1]]
+    assert essences(events[:-1]) == essences(whole[: len(events) - 1])
 
 
 @pytest.mark.parametrize("layout", ["small chunks", "no index", "no compression"])
@@ -124,8 +123,7 @@ def test_a_broken_chunk_loses_its_own_messages_with_their_times(sample, whole, t
     lost = [(time, stream) for time, stream, item in events if isinstance(item, Exception)]
     assert lost == [(broken.message_start_time, "left")]
     assert any(str(item).startswith(f"{LEFT}: the chunk at byte") for _, _, item in events)
-    kept = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
-    assert kept == [essence(item) for time, stream, item in whole if (time, stream) not in lost]
+    assert sound(events) == essences(event for event in whole if event[:2] not in lost)
     assert inventory_of(damaged)["damage"]
 
 
@@ -162,8 +160,7 @@ def test_a_broken_record_length_loses_that_record(sample, whole, tmp_path):
     assert losses == [
         f"damaged.mcap: the log is damaged from byte {chunks[3]} to byte {chunks[4]}; messages there may be lost"
     ]
-    good = [essence(item) for _, _, item in events if not isinstance(item, Exception)]
-    assert good == [essence(item) for _, _, item in whole]  # the chunk itself was whole
+    assert sound(events) == essences(whole)  # the chunk itself was whole
 
 
 def test_a_broken_length_does_not_fill_the_memory(tmp_path):
@@ -221,9 +218,7 @@ def test_an_impossible_log_time_loses_its_message(sample, whole, tmp_path, layou
 
     path = rewrite(sample, tmp_path / "log.mcap", time=damage, **LAYOUTS[layout])
     *events, (time, stream, error) = items_of(path)
-    assert [essence(item) for _, _, item in events] == [
-        essence(item) for at, stream, item in whole if (at, stream) != (third, "left")
-    ]
+    assert essences(events) == essences(event for event in whole if event[:2] != (third, "left"))
     assert (time, stream) == (whole[-1][0], "left")
     assert "log time is damaged" in str(error)
     assert inventory_of(path)["end"] == whole[-1][0]
@@ -242,7 +237,7 @@ def test_statistics_without_channel_counts_do_not_mean_an_empty_log(sample, whol
     written = Statistics.write
     monkeypatch.setattr(Statistics, "write", lambda self, to: written(replace(self, channel_message_counts={}), to))
     path = rewrite(sample, tmp_path / "log.mcap", chunk_size=500)
-    assert [essence(item) for _, _, item in items_of(path)] == [essence(item) for _, _, item in whole]
+    assert essences(items_of(path)) == essences(whole)
 
 
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no index", "no crcs"])
@@ -252,7 +247,7 @@ def test_bytes_after_the_end_of_a_log_are_reported(sample, whole, tmp_path, layo
     path = tmp_path / "log.mcap"
     path.write_bytes(first + (first if second == "log" else bytes(5000)))
     *events, (_, stream, lost) = items_of(path)
-    assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
+    assert essences(events) == essences(whole)
     size = len(first) if second == "log" else 5000
     sentence = (
         f"the log ends at byte {len(first)}, and the {size} bytes after it are not read; give each log as its own file"

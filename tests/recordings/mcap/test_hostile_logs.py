@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import pytest
 import zstandard
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
@@ -26,8 +25,9 @@ from recordings.ros2.cdr import make
 from tests.conftest import rewrite
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
+from tests.recordings import sample_log
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
-from tests.recordings.sample_log import LEFT, START, TILT, essence, items_of, write_sample
+from tests.recordings.sample_log import LEFT, START, TILT, essences, items_of, sound, write_sample
 
 Extra = Callable[[Writer, dict[str, int]], object]
 NOTHING = b"\0\1\0\0" + bytes(8)
@@ -36,22 +36,7 @@ MILLISECOND = 1_000_000
 
 def with_extra(extra: Extra, **options: Any) -> Callable[[Path], Path]:
     """A function that writes the sample log with something more."""
-
-    def write(folder: Path) -> Path:
-        sample, path = write_sample(folder / "sample.mcap"), folder / "log.mcap"
-        with sample.open("rb") as stream, path.open("wb") as out:
-            writer, channels = Writer(out, **options), dict[str, int]()
-            writer.start(profile="ros2")
-            for schema, channel, message in make_reader(stream).iter_messages():
-                if channel.topic not in channels:
-                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
-                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
-            extra(writer, channels)
-            writer.finish()
-        return path
-
-    return write
+    return lambda folder: sample_log.with_extra(folder / "log.mcap", extra, **options)
 
 
 def images(data: bytes, size: int) -> Callable[[Path], Path]:
@@ -282,8 +267,7 @@ def test_a_topic_faster_than_any_sensor_is_refused_unless_a_setting_allows_it(tm
         assert "/imu/data: over 20 of its 25 messages were logged within 10 s" in log.missing["inclinometer"]
         assert "set 'max_rate' of the source to the rate of the sensor" in log.missing["inclinometer"]
     with McapSource(max_rate=3).open(path) as log:
-        found = [essence(item) for _, _, item in log.events() if not isinstance(item, LogError)]
-    assert found == [essence(item) for _, _, item in whole]
+        assert sound(log.events()) == essences(whole)
 
 
 @pytest.mark.parametrize("cut", [0, 2000, 2020])
@@ -315,7 +299,7 @@ def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tm
         monkeypatch.setattr(message_order, "MAX_OPEN_BYTES", limit)
         times.clear()
         events = items_of(path)
-        assert [essence(item) for _, _, item in events] == [essence(item) for _, _, item in whole]
+        assert essences(events) == essences(whole)
         counts.append(len(times))
     assert counts[1] > counts[0]
 
@@ -327,6 +311,4 @@ def test_a_message_that_no_recorder_writes_is_lost_alone(tmp_path, whole, use_ch
     found = items_of(path)
     lost = [str(item) for _, _, item in found if isinstance(item, LogError)]
     assert lost == [f"{LEFT}: the message has 146800640 bytes; the limit is 134217728"]
-    assert [essence(item) for _, _, item in found if not isinstance(item, LogError)] == [
-        essence(item) for _, _, item in whole
-    ]
+    assert sound(found) == essences(whole)

@@ -88,14 +88,6 @@ def test_gray_of_16_bit_is_read_in_its_byte_order(big):
     np.testing.assert_array_equal(pixels_of(raw_image("mono8", picture(1)[:, :, 0], WIDTH)), picture(1)[:, :, 0])
 
 
-@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_a_bayer_image_of_one_colour_has_that_colour(pattern):
-    colour = {"r": 200, "g": 90, "b": 30}
-    tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
-    out = pixels_of(raw_image(f"bayer_{pattern}8", np.tile(tile, (8, 12)), 24))
-    np.testing.assert_array_equal(out, np.broadcast_to([200, 90, 30], (16, 24, 3)))
-
-
 def compressed(data: bytes, kind: str) -> Any:
     content = np.frombuffer(data, np.uint8)
     return make("sensor_msgs/msg/CompressedImage", header=header(1, "cam"), format=kind, data=content)

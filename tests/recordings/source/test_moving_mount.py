@@ -15,7 +15,6 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import camera_info, header, image, imu, odometry, transform_message
 from stages.data import CameraImage, Mount, Pose, Transform
-from tests.recordings.encodings.rewritten import ros1_bag
 from tests.recordings.sample_log import START, TRANSFORMS, model, picture
 
 MS = 1_000_000
@@ -93,14 +92,6 @@ def test_the_mount_is_interpolated_at_the_time_of_each_frame(tmp_path):
     later = read(tmp_path / "log.mcap", start=1.5)[0]
     assert [mount.stamp for mount in later] == [mount.stamp for mount in mounts[3:]]
     np.testing.assert_array_equal(later[0].camera_from_inclinometer, mounts[3].camera_from_inclinometer)
-
-
-def test_a_ros_1_bag_has_the_same_mounts(tmp_path):
-    path = written(tmp_path / "log.mcap")
-    mounts, lost, _ = read(ros1_bag(path, tmp_path / "log.bag"))
-    assert lost == []
-    rotations = [[mount.camera_from_inclinometer for mount in found] for found in (mounts, read(path)[0])]
-    np.testing.assert_array_equal(*rotations)
 
 
 def test_the_topic_of_the_mast_may_be_that_of_the_pose(tmp_path):

@@ -21,7 +21,6 @@ from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite, slow
-from tests.recordings.encodings.rewritten import ros1_bag
 from tests.recordings.inertial.drive import Drive, drive
 from tests.recordings.sample_log import TRANSFORMS, model, picture
 
@@ -100,13 +99,6 @@ def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why
         assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in (
             format_description(describe(log, max_gap_of=lambda intervals: 10**8))
         )
-
-
-def test_a_ros_1_bag_has_the_same_estimates(tmp_path):
-    path = written(tmp_path / "log.mcap", drive(seconds=6))
-    tilts, lost, _ = read(ros1_bag(path, tmp_path / "log.bag"))
-    assert lost == []
-    np.testing.assert_array_equal([tilt.up for tilt in tilts], [tilt.up for tilt in read(path)[0]])
 
 
 def test_a_part_of_a_log_has_tilts_as_good_as_the_whole(tmp_path):

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.video.formats import FrameNumbers, is_key_frame
 from stages.data import CameraImage
+from tests.conftest import rewrite
 from tests.recordings.sample_log import LEFT, items_of
 from tests.recordings.video.encoder import KEY_INTERVAL, Encoder, gray_of, video_log
 
@@ -25,18 +24,7 @@ def images_of(path, side="left", **bounds):
 
 def without(path, out, topic, number):
     """The log without one message, as if it had never arrived."""
-    with path.open("rb") as file, out.open("wb") as made:
-        writer, channels, seen = Writer(made), dict[int, int](), 0
-        writer.start()
-        for schema, channel, message in make_reader(file).iter_messages():
-            if channel.id not in channels:
-                own = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, own)
-            seen += channel.topic == topic
-            if channel.topic != topic or seen != number + 1:
-                writer.add_message(channels[channel.id], message.log_time, message.data, message.log_time)
-        writer.finish()
-    return out
+    return rewrite(path, out, lambda *of: None if of[:2] == (topic, number) else of[2])
 
 
 @pytest.mark.parametrize(
