@@ -30,7 +30,8 @@ from flow.cli.commands import (
     stages,
 )
 from flow.cli.debugging import attempt, desk, diff, report, why
-from flow.cli.importers import devon, euroc, images, katwijk, kitti, lusnar, middlebury, tartanair
+from flow.cli.importers import images, middlebury
+from flow.cli.importers.data_sets import DATA_SETS, DataSet
 from flow.cli.replay import product_version
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
@@ -53,16 +54,12 @@ COMMANDS: dict[str, ModuleType] = {
     "fleet": fleet,
     "list": listing,
 }
-IMPORTERS: dict[str, ModuleType] = {
-    "devon": devon,
-    "euroc": euroc,
+_IMPORTERS: dict[str, ModuleType | DataSet] = {
     "images": images,
-    "katwijk": katwijk,
-    "kitti": kitti,
-    "lusnar": lusnar,
     "middlebury": middlebury,
-    "tartanair": tartanair,
+    **{each.kind: each for each in DATA_SETS},
 }
+IMPORTERS = {kind: _IMPORTERS[kind] for kind in sorted(_IMPORTERS)}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -163,12 +160,12 @@ def parser() -> argparse.ArgumentParser:
     make = "make a log from other recordings"
     kinds = commands.add_parser("import", help=make, description=_titled(make))
     importers = kinds.add_subparsers(required=True, metavar="KIND")
-    for name, command in IMPORTERS.items():
-        _add(importers, name, command)
+    for name, importer in IMPORTERS.items():
+        _add(importers, name, importer)
     return top
 
 
-def _add(commands: Any, name: str, command: ModuleType) -> None:
+def _add(commands: Any, name: str, command: ModuleType | DataSet) -> None:
     sub: argparse.ArgumentParser = commands.add_parser(name, help=command.HELP, description=_titled(command.HELP))
     command.add_arguments(sub)
     sub.add_argument("--debug", action="store_true", help="print tracebacks")

@@ -1,43 +1,16 @@
-"""What the importers of recordings share: the rig file, progress, and what they print."""
+"""What importers share: progress, and what they print."""
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.contracts import counted
 from flow.errors import COMPLETE
-
-if TYPE_CHECKING:
-    from recordings.importers.recording import ImportedRecording
-    from recordings.importers.rig import Rig
-
-
-def add_recording_arguments(sub: argparse.ArgumentParser, source: str, rig: str) -> None:
-    """Add SOURCE, OUT.mcap and --rig. source: what the folder contains; rig: what the rig file says."""
-    sub.add_argument("source", type=Path, metavar="SOURCE", help=source)
-    sub.add_argument("out", type=Path, metavar="OUT.mcap")
-    sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"what the files do not say: {rig}")
-
-
-def import_recording(
-    options: argparse.Namespace, entries: Collection[str], read: Callable[[Rig], ImportedRecording]
-) -> int:
-    """Read and write a recording, and print notes, frames and size. entries: that the rig file may have."""
-    from recordings.importers.recording import write_recording
-    from recordings.importers.rig import read_rig
-
-    check_outputs({"input log": options.out}, [path for path in [options.rig] if path is not None])
-    recording = read(read_rig(options.rig, entries))
-    with progress_bar(options.out, len(recording.pairs)) as shown:
-        frames, notes = write_recording(recording, options.out, *shown)
-    return complete(options, frames, notes)
 
 
 @contextmanager
