@@ -155,7 +155,6 @@ class _Reader:
         self._own = {number for number in log.channels if number <= last}
         self.topics = {log.channels[number].topic for number in self._own}
         self.copied = {channel.topic for number, channel in log.channels.items() if number > last}
-        self._decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
 
     def groups(self) -> Iterator[tuple[int, dict[str, tuple[int, bytes]]]]:
         """(Stamp, topic -> number of its channel and bytes)."""
@@ -175,9 +174,7 @@ class _Reader:
         schema = self.log.channels[number].schema
         if schema is None:
             return data
-        if number not in self._decoders:
-            self._decoders[number] = decoder_for(schema.name, schema.encoding, schema.text)
-        return self._decoders[number](data)
+        return decoder_for(schema.name, schema.encoding, schema.text)(data)
 
 
 def _changes(one: _Reader, other: _Reader, topics: Mapping[str, TopicDiff]) -> Iterator[MessageDifference]:

@@ -13,6 +13,7 @@ from recordings.atomic_write import written
 from recordings.export.page_layout import page_of
 from recordings.sinks.colormaps import top_eight_bits
 from recordings.sinks.overwrite import PICTURE
+from recordings.sinks.png import png
 from stages.data import Array
 
 MARK = np.array([235, 40, 200], np.float32)  # RGB
@@ -45,8 +46,7 @@ def write_marked(path: Path, image: Array, pixels: Array, title: str) -> None:
         zoomed = cv2.resize(part, (height, height), interpolation=cv2.INTER_NEAREST)
         rgb = np.hstack([rgb, np.full((height, 8, 3), 255, np.uint8), zoomed])
     with written(path) as temporary:
-        _, blob = cv2.imencode(".png", cv2.cvtColor(page_of(rgb, title, beside=1), cv2.COLOR_RGB2BGR))
-        temporary.write_bytes(_named(blob.tobytes()))
+        temporary.write_bytes(_named(png(page_of(rgb, title, beside=1))))
 
 
 def _around(rgb: Array, rows: Array, cols: Array) -> Array:
@@ -58,9 +58,9 @@ def _around(rgb: Array, rows: Array, cols: Array) -> Array:
     return rgb[top : top + size, left : left + size].copy()
 
 
-def _named(png: bytes) -> bytes:
+def _named(picture: bytes) -> bytes:
     """A PNG file with the name of the program, by which a later picture may replace it."""
     chunk = b"tEXt" + PICTURE
     named = struct.pack(">I", len(PICTURE)) + chunk + struct.pack(">I", zlib.crc32(chunk))
     header = 33  # bytes of the signature and the first chunk
-    return png[:header] + named + png[header:]
+    return picture[:header] + named + picture[header:]

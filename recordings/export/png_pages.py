@@ -18,6 +18,7 @@ from recordings.export.page_layout import add_bar, add_legend, map_page, page_of
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from recordings.sinks import colormaps
+from recordings.sinks.png import png
 from stages.data import Array, Cell, ElevationMap, NavigationMap
 
 
@@ -37,7 +38,7 @@ def draw(result: Path, out: Path) -> list[Path]:
         if stamp in chosen:
             name, page_of = PAGES[topic]
             path = out / f"frame-{chosen[stamp]:04d}-{name}.png"
-            _write(path, page_of(message))
+            path.write_bytes(png(page_of(message)))
             written.append(path)
     return sorted(written)
 
@@ -87,8 +88,3 @@ PAGES: Mapping[str, tuple[str, Callable[[Any], Array]]] = {
     "/nav/elevation_map": ("elevation", lambda message: elevation_page(read_grid_map(message))),
     "/nav/navigation_map": ("navigation", lambda message: navigation_page(read_occupancy_grid(message))),
 }
-
-
-def _write(path: Path, rgb: Array) -> None:
-    _, blob = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-    path.write_bytes(blob.tobytes())

@@ -56,7 +56,7 @@ def describe(
     damage = Damage(sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems}))
     delays = array("q")
     stamps = {stream: _stamps(log, stream, damage, delays if stream == "left" else None) for stream in CAMERAS}
-    stamps["inclinometer"] = (_tilts if _is_verified(log) else _tilt_stamps)(log, damage)
+    stamps["inclinometer"] = _tilts(log, damage)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
     max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
     return {
@@ -141,8 +141,11 @@ def _stamps(log: McapLog, stream: str, damage: Damage, delays: array[int] | None
 
 
 def _tilts(log: McapLog, damage: Damage) -> Stamps:
-    """The stamps of the tilts, ns; errors are added to `damage`. Nothing is estimated for them."""
-    if log.resolution.tilt is not None and log.resolution.tilt.gyroscope:
+    """The stamps of the tilts, ns; errors are added to `damage`. Nothing is estimated for them.
+
+    Those of a large log are not decoded.
+    """
+    if not _is_verified(log) or (log.resolution.tilt is not None and log.resolution.tilt.gyroscope):
         return _stamps(log, "inclinometer", damage)
     stamps = array("q")
     for _, stream, item in log.events(("inclinometer",)):
@@ -151,11 +154,6 @@ def _tilts(log: McapLog, damage: Damage) -> Stamps:
         elif stream == "inclinometer":
             damage.append(str(item))
     return np.asarray(stamps, np.int64)
-
-
-def _tilt_stamps(log: McapLog, damage: Damage) -> Stamps:
-    """The stamps of the tilts of a large log, ns, without decoding them."""
-    return _stamps(log, "inclinometer", damage)
 
 
 def _is_verified(log: McapLog) -> bool:

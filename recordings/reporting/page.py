@@ -6,16 +6,14 @@ import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 
 from flow.contracts import counted
 from recordings.atomic_write import written
 from recordings.comparison.diff import diff
 from recordings.comparison.text import format_diff, moment
-from recordings.export.png_pages import disparity_page, elevation_page, navigation_page
+from recordings.export.png_pages import PAGES
 from recordings.reporting.figures import line_plot, picture, track_plot
 from recordings.reporting.run_facts import REGIONAL, RunFacts, read_facts
-from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from recordings.sinks.overwrite import REPORT
 
 MAX_LOSSES = 100  # rows of the table
@@ -89,13 +87,14 @@ def _verdict(facts: RunFacts) -> str:
 
 
 def _regional(facts: RunFacts) -> str:
-    """The last regional maps, or those of the typical frame where there are none."""
-    terrain, navigation = (facts.regional.get(topic) for topic in REGIONAL)
-    pictures = []
-    if terrain is not None:
-        pictures.append(picture(elevation_page(read_grid_map(terrain)), "regional elevation map"))
-    if navigation is not None:
-        pictures.append(picture(navigation_page(read_occupancy_grid(navigation)), "regional navigation map"))
+    """The last regional maps."""
+    pictures = [
+        picture(
+            PAGES[of_frame][1](facts.regional[topic]), f"regional {of_frame.removeprefix('/nav/').replace('_', ' ')}"
+        )
+        for topic, of_frame in REGIONAL.items()
+        if topic in facts.regional
+    ]
     return f"<div class=pictures>{''.join(pictures)}</div>" if pictures else ""
 
 
@@ -121,12 +120,7 @@ def _frame(facts: RunFacts, name: str) -> str:
     if name not in facts.drawn:
         return ""
     stamp, messages = facts.drawn[name]
-    draw: dict[str, Any] = {
-        "/nav/disparity": lambda message: disparity_page(read_disparity(message)),
-        "/nav/elevation_map": lambda message: elevation_page(read_grid_map(message)),
-        "/nav/navigation_map": lambda message: navigation_page(read_occupancy_grid(message)),
-    }
-    pictures = [picture(draw[topic](message), f"{topic} of the {name}") for topic, message in messages.items()]
+    pictures = [picture(PAGES[topic][1](message), f"{topic} of the {name}") for topic, message in messages.items()]
     return f"<p>at {moment(stamp)}</p><div class=pictures>{''.join(pictures)}</div>"
 
 

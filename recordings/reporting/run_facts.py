@@ -9,18 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.reader import make_reader
 
+from recordings.export.png_pages import PAGES
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
-from recordings.scoring.result_log import check_profile, facts_of
+from recordings.scoring.result_log import check_profile, end_of_run, facts_of
 from stages.data import Cell
 
-TOPICS = (
-    "/nav/disparity", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/diagnostics", "/nav/regional_map",
-    "/nav/regional_navigation_map",
-)  # fmt: skip
-REGIONAL = ("/nav/regional_map", "/nav/regional_navigation_map")
+# Topic of a regional map -> that of the same map of a frame
+REGIONAL = {"/nav/regional_map": "/nav/elevation_map", "/nav/regional_navigation_map": "/nav/navigation_map"}
+TOPICS = (*PAGES, "/nav/pose", "/nav/diagnostics", *REGIONAL)
 
 
 @dataclass
@@ -57,7 +55,7 @@ def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) 
     """
     about = facts_of(path, "a log that roverflow run wrote")
     check_profile(path, about)
-    facts = RunFacts(path, about, _counts(path))
+    facts = RunFacts(path, about, end_of_run(path))
     for topic, stamp, message in iter_decoded(path, TOPICS, facts.unreadable):
         _add(facts, topic, stamp, message)
     facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
@@ -66,7 +64,7 @@ def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) 
         chosen = _chosen(facts)
     frames = {stamp: dict[str, Any]() for stamp in chosen.values()}
     if frames:
-        for topic, stamp, message in iter_decoded(path, TOPICS[:3], Counter()):
+        for topic, stamp, message in iter_decoded(path, PAGES, Counter()):
             if stamp in frames:
                 frames[stamp][topic] = message
     facts.drawn = {name: (stamp, frames[stamp]) for name, stamp in chosen.items()}
@@ -103,15 +101,3 @@ def _chosen(facts: RunFacts) -> dict[str, int]:
     if not ordered:
         return {}
     return {"typical frame": ordered[len(ordered) // 2]} | ({"worst frame": ordered[0]} if len(ordered) > 1 else {})
-
-
-def _counts(path: Path) -> dict[str, str]:
-    """The verdict, counts and findings of the run; empty if its end is missing."""
-    try:
-        with path.open("rb") as file:
-            for record in make_reader(file).iter_metadata():
-                if record.name == "roverflow.run":
-                    return dict(record.metadata)
-    except Exception:  # of a cut log, by mcap's reader
-        return {}
-    return {}

@@ -46,13 +46,18 @@ def check_profile(path: Path, about: Mapping[str, str]) -> None:
         raise LogError(f"{path} has results in Foxglove's messages; run the log again with --profile ros2")
 
 
-def pipeline_of(result: Path) -> str:
-    """The name of the pipeline that wrote a complete result log."""
-    with suppress(*_UNREADABLE), result.open("rb") as file:
+def end_of_run(result: Path) -> dict[str, str]:
+    """The pipeline, the verdict, counts and findings of a run; empty if the end of its result log is missing."""
+    with suppress(Exception), result.open("rb") as file:  # a cut log fails mcap's reader in any way
         for record in make_reader(file).iter_metadata():
             if record.name == "roverflow.run":
-                return record.metadata["pipeline"]
-    return "unknown"
+                return dict(record.metadata)
+    return {}
+
+
+def pipeline_of(result: Path) -> str:
+    """The name of the pipeline that wrote a complete result log."""
+    return end_of_run(result).get("pipeline", "unknown")
 
 
 def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
