@@ -52,6 +52,20 @@ def find_files(given: Path | Sequence[Path]) -> FoundFiles:
     return FoundFiles(files, missing, _split_of(files[0]) if len(files) == 1 and named else "")
 
 
+def first_bytes(path: Path, kind: str = "a log") -> bytes:
+    """The first bytes of a file. kind: of the file, for the sentence. Raises LogError for what is none, or empty."""
+    if path.exists() and not path.is_file():
+        raise LogError(f"{path} is {'a folder' if path.is_dir() else 'a pipe or a device'}; give {kind}")
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
+    if not start:
+        raise LogError(f"{path} is empty (0 bytes); record it again")
+    return start
+
+
 def _files_of(folder: Path) -> FoundFiles:
     """The files of the recording in a folder."""
     try:

@@ -133,7 +133,7 @@ class Recording:
     part : str
         A sentence if the path is only one of several files of a recording.
     on_close : callable
-        Closes the files; by default their `close`.
+        Closes the files.
 
     Attributes
     ----------
@@ -147,12 +147,12 @@ class Recording:
         self,
         path: Path,
         files: Sequence[Container],
-        missing: Sequence[str] = (),
-        part: str = "",
-        on_close: Callable[[], object] | None = None,
+        missing: Sequence[str],
+        part: str,
+        on_close: Callable[[], object],
     ) -> None:
         self.path, self.files, self.part, self._missing = path, files, part, missing
-        self._on_close = on_close or self._close_files
+        self._on_close = on_close
         self.size = sum(file.size for file in files)
         self.channels, self._numbers = _merged_channels(files)
         self._stamped = {number for number, channel in self.channels.items() if begins_with_header(channel)}
@@ -267,10 +267,6 @@ class Recording:
         """Close the files."""
         self._on_close()
 
-    def _close_files(self) -> None:
-        for file in self.files:
-            file.close()
-
     def __enter__(self) -> Recording:
         return self
 
@@ -304,9 +300,14 @@ class Recording:
         They are judged by channel: two channels of a topic, such as results beside inputs, are stored independently.
         """
         timelines = [file.timeline for file in self.files]
-        stamps = _StampReader(self.files, [0, *np.cumsum([len(timeline) for timeline in timelines]).tolist()])
+        firsts = [0, *np.cumsum([len(timeline) for timeline in timelines]).tolist()]  # places in the recording
+
+        def stamp_at(place: int) -> int:
+            number = int(np.searchsorted(firsts, place, side="right")) - 1
+            return _stamp_at(self.files[number], place - firsts[number])
+
         if len(self.files) == 1:
-            return clock_steps(timelines[0], self._stamped, stamps)
+            return clock_steps(timelines[0], self._stamped, stamp_at)
         channels = list[NDArray[np.int32]]()
         for numbers, timeline in zip(self._numbers, timelines, strict=True):
             merged_of = np.full(np.max(timeline.channels, initial=0) + 1, -1, np.int32)  # -1: of no known channel
@@ -314,24 +315,13 @@ class Recording:
                 merged_of[own : own + 1] = number
             channels.append(merged_of[timeline.channels])
         merged = Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
-        return clock_steps(merged, self._stamped, stamps)
+        return clock_steps(merged, self._stamped, stamp_at)
 
 
-@dataclass(frozen=True)
-class _StampReader:
-    """Reads the header stamp of the message at a place; 0 if a damaged index gives it another log time.
-
-    firsts: the place of the first message of each file.
-    """
-
-    files: Sequence[Container]
-    firsts: Sequence[int]
-
-    def __call__(self, place: int) -> int:
-        number = int(np.searchsorted(self.firsts, place, side="right")) - 1
-        file, own = self.files[number], place - self.firsts[number]
-        channel = int(file.timeline.channels[own])
-        for item in file.messages({channel}, places=range(own, own + 1)):
-            if isinstance(item, RawMessage) and item.log_time == file.timeline.log_times[own]:
-                return peek_stamp(item.data, file.channels[channel].message_encoding)
-        return 0
+def _stamp_at(file: Container, place: int) -> int:
+    """The header stamp of the message at a place of a file; 0 if a damaged index gives it another log time."""
+    channel = int(file.timeline.channels[place])
+    for item in file.messages({channel}, places=range(place, place + 1)):
+        if isinstance(item, RawMessage) and item.log_time == file.timeline.log_times[place]:
+            return peek_stamp(item.data, file.channels[channel].message_encoding)
+    return 0

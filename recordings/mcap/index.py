@@ -26,6 +26,7 @@ from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
 from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
+from recordings.containers.finding import first_bytes
 from recordings.containers.timeline import MAX_LOG_TIME
 from recordings.errors import LogError, sentence_of
 
@@ -113,21 +114,10 @@ def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
 
 def opened(path: Path) -> BinaryIO:
     """The open file, if it begins like an MCAP file."""
-    if path.is_dir():
-        raise LogError(f"{path} is a folder; give the .mcap file in it")
-    if path.exists() and not path.is_file():
-        raise LogError(f"{path} is a pipe or a device; give a .mcap file")
-    try:
-        file = path.open("rb")
-    except OSError as error:
-        raise LogError(f"cannot read {path}: {error.strerror or error}") from error
-    start = file.read(16)
-    if start.startswith(MAGIC):
-        return file
-    file.close()
-    if not start:
-        raise LogError(f"{path} is empty (0 bytes); record it again")
-    raise LogError(f"{path} is not an MCAP log (its first bytes differ); give a .mcap file")
+    start = first_bytes(path, "a .mcap file")
+    if not start.startswith(MAGIC):
+        raise LogError(f"{path} is not an MCAP log (its first bytes differ); give a .mcap file")
+    return path.open("rb")
 
 
 def index_from_summary(file: BinaryIO, size: int) -> Index | None:
