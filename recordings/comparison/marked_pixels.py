@@ -21,18 +21,9 @@ PART_PX = 160  # width and height of the part that is enlarged, at least
 
 
 def write_marked(path: Path, image: Array, pixels: Array, title: str) -> None:
-    """Write a PNG file.
+    """Write a PNG file of an image, gray (H, W) or RGB (H, W, 3), uint8 or uint16, with a title above it.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    image : (H, W) or (H, W, 3) ndarray
-        Gray or RGB, uint8 or uint16.
-    pixels : (N,) ndarray
-        Indices of the marked pixels in the flattened image.
-    title : str
-        A line above the picture.
+    pixels: (N,) indices of the marked pixels in the flattened image.
     """
     (gray,) = top_eight_bits(image)
     rgb = np.repeat(gray[:, :, None], 3, axis=2) if gray.ndim == 2 else gray.copy()

@@ -23,19 +23,9 @@ class _Grid(NamedTuple):
 
 
 def measures(schema: str, one: Any, other: Any) -> Measures:
-    """What differs between two messages; empty where only bytes without a measure differ.
-
-    Parameters
-    ----------
-    schema : str
-        Full ROS 2 name of the type.
-    one, other : message
-        Two decoded messages of one topic and stamp.
-
-    Returns
-    -------
-    dict
-        Name with unit -> number, such as {"pixels": 120, "largest px": 0.5}. A larger number is a larger difference.
+    """What differs between two decoded messages of one topic and stamp: name with unit -> number, such as
+    {"pixels": 120, "largest px": 0.5}. A larger number is a larger difference. Empty where only bytes without a measure
+    differ. schema: full ROS 2 name of the type.
     """
     measure = _MEASURES.get(schema)
     return {} if measure is None else {name: value for name, value in measure(one, other).items() if value}

@@ -33,12 +33,7 @@ FLIPS = {
 def pages(schema: str, one: Any, other: Any) -> tuple[Array, Array, Array] | None:
     """A, B, and B less A as RGB pages with one extent and one scale; None for a type without pages.
 
-    Parameters
-    ----------
-    schema : str
-        Full ROS 2 name of the type.
-    one, other : message
-        Two decoded messages.
+    schema: full ROS 2 name of the type of the decoded messages.
     """
     if schema not in _PAGES or (schema == _GRID_MAP and "elevation" not in read_layers(one)):
         return None

@@ -122,25 +122,10 @@ def _repeated(step: ClockStep) -> str:
 class Recording:
     """The messages of one or several files as one log; use it as a context manager.
 
-    Parameters
-    ----------
-    path : Path
-        What the user gave: the file or the folder.
-    files : sequence of Container
-        The files in the order in which they were recorded.
-    missing : sequence of str
-        Sentences about files that are not there; their messages are lost.
-    part : str
-        A sentence if the path is only one of several files of a recording.
-    on_close : callable
-        Closes the files.
-
-    Attributes
-    ----------
-    channels : dict of int to Channel
-        The channels of all files by number; a topic may have several.
-    start, end : int
-        Log time of the first and the last message, ns.
+    path: what the user gave, the file or the folder; files: in the order in which they were recorded; missing:
+    sentences about files that are not there, whose messages are lost; part: a sentence if the path is only one of
+    several files of a recording; on_close: closes the files. channels: of all files by number, a topic may have
+    several; start, end: log time of the first and the last message, ns.
     """
 
     def __init__(

@@ -116,19 +116,9 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
     A height is the mean by inverse variance. The variance of a cell in conflict contains the spread of its heights. A
     cell is a hazard if it is one in any log, and free if it is free in a log and not in conflict.
 
-    Parameters
-    ----------
-    results
-        Logs that runs wrote, with poses in one frame of reference.
-    out
-        The folder.
-    lost
-        If given, damaged logs are merged as far as they are readable, and the reasons of losses are counted here.
-
-    Raises
-    ------
-    LogError
-        If a log has no regional map with variances, or the maps differ in frame or cell size.
+    results: logs that runs wrote, with poses in one frame of reference; lost: if given, damaged logs are merged as far
+    as they are readable, and the reasons of losses are counted here. Raises LogError if a log has no regional map with
+    variances, or the maps differ in frame or cell size.
     """
     regions, stamp, grid = list[dict[tuple[int, int], Array]](), 0, None
     for result in results:

@@ -16,24 +16,11 @@ def ground_disparity(camera: StereoCamera, up: Array, height: float) -> float:
     """The largest disparity, px, of level ground in view.
 
     A ray r = (x, y, 1) meets the ground at the depth height / -(up . r). So the disparity is fx * baseline * -(up . r)
-    / height, which is largest in a corner of the image.
+    / height, which is largest in a corner of the image; 0 where no ground is in view.
 
-    Parameters
-    ----------
-    camera : StereoCamera
-        Of the rectified images.
-    up : (3,) ndarray
-        Unit vector against gravity in the coordinates of the left image (x right, y down, z forward).
-    height : float
-        Of the camera above the ground, m.
+    camera: of the rectified images; up: (3,) unit vector against gravity in the coordinates of the left image (x right,
+    y down, z forward); height: of the camera above the ground, m.
 
-    Returns
-    -------
-    float
-        0 where no ground is in view.
-
-    Examples
-    --------
     >>> camera = StereoCamera(fx=500, fy=500, cx=320, cy=240, baseline=0.2, width=640, height=480)
     >>> round(ground_disparity(camera, np.array([0.0, -1.0, 0.0]), height=1.0), 3)
     47.8

@@ -57,29 +57,10 @@ class _Queued(NamedTuple):
 class McapFile:
     """An MCAP file open for reading; use it as a context manager.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
+    start, end: log time of the first and the last message, ns; channels: by number, each with its encoding and schema;
+    size: bytes; index: where chunks and messages are. Raises LogError if the file does not exist, is not an MCAP file
+    or contains no messages.
 
-    Attributes
-    ----------
-    start, end : int
-        Log time of the first and the last message, ns.
-    channels : dict of int to Channel
-        The channels by number, each with its encoding and schema.
-    size : int
-        Bytes.
-    index : Index
-        Where chunks and messages are.
-
-    Raises
-    ------
-    LogError
-        If the file does not exist, is not an MCAP file or contains no messages.
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> from recordings.mcap.writer import Ros2Writer
     >>> from recordings.ros2.to_msg import imu
@@ -350,28 +331,10 @@ class McapFile:
 def iter_decoded(
     path: Path, topics: Iterable[str] | None = None, lost: Counter[str] | None = None, part: Edges = (None, None)
 ) -> Iterator[tuple[str, int, Any]]:
-    """Read a log's ROS 2 CDR messages in log-time order.
+    """Topic, log time in ns and decoded message of an MCAP log's ROS 2 CDR messages, in log-time order.
 
-    Parameters
-    ----------
-    path : Path
-        The MCAP file.
-    topics : iterable of str, optional
-        The topics to read; by default all in CDR.
-    lost : Counter, optional
-        Counts the reasons why messages were lost.
-    part : Edges
-        The part of the log to read; by default all.
-
-    Yields
-    ------
-    tuple of (str, int, object)
-        Topic, log time in ns, decoded message.
-
-    Raises
-    ------
-    LogError
-        At the first message that cannot be read, unless `lost` is given.
+    topics: those to read, by default all in CDR; lost: counts the reasons why messages were lost; part: of the log, by
+    default all. Raises LogError at the first message that cannot be read, unless `lost` is given.
     """
 
     def lose(why: str) -> None:

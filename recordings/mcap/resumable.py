@@ -29,20 +29,9 @@ from recordings.mcap.writer import MessageKind, Ros2Writer
 class ResumableWriter(Ros2Writer):
     """A `Ros2Writer` whose unfinished log stays after an interrupt, a full disk or a kill, and is continued.
 
-    Parameters
-    ----------
-    path : Path
-        The log.
-    mark : str
-        States what the log is made from; only an unfinished log of the same mark is continued.
-    resumed : callable
-        Called once if there is an unfinished log: with True after its last message, with False at a message that
-        differs or for another mark.
-
-    Raises
-    ------
-    UnwritableError
-        If the log cannot be written, or another writer of the same mark is at work.
+    mark: states what the log is made from; only an unfinished log of the same mark is continued. resumed: called once
+    if there is an unfinished log, with True after its last message, with False at a message that differs or for another
+    mark. Raises UnwritableError if the log cannot be written, or another writer of the same mark is at work.
     """
 
     def __init__(self, path: Path, mark: str, resumed: Callable[[bool], None] = lambda whole: None) -> None:

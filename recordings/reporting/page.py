@@ -23,12 +23,7 @@ STYLE = Path(__file__).with_name("style.css")
 def write_report(path: Path, results: Sequence[Path]) -> None:
     """Write the page of one result log, or of two beside each other.
 
-    Raises
-    ------
-    LogError
-        If a file is no result log, or cannot be read.
-    UnwritableError
-        If the page cannot be written.
+    Raises LogError if a file is no result log or cannot be read, and UnwritableError if the page cannot be written.
     """
     facts = [read_facts(results[0])]
     facts += [read_facts(result, facts[0].drawn) for result in results[1:]]

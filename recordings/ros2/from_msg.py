@@ -117,20 +117,8 @@ def pose_of(message: Any, log_time: int, base_frame: str) -> Pose | None:
 
 
 def read_disparity(message: Any) -> NDArray[np.float32]:
-    """Read a stereo_msgs/DisparityImage.
+    """The pixels of a stereo_msgs/DisparityImage, (H, W) float32, px, NaN = unknown. Raises ValueError unless 32FC1.
 
-    Returns
-    -------
-    ndarray
-        (H, W) float32, px, NaN = unknown.
-
-    Raises
-    ------
-    ValueError
-        If the image is not 32FC1.
-
-    Examples
-    --------
     >>> from recordings.ros2.to_msg import disparity_image
     >>> from stages.data import Disparity
     >>> pixels = np.full((1, 2), 7.5, np.float32)
@@ -146,17 +134,9 @@ def read_disparity(message: Any) -> NDArray[np.float32]:
 
 
 def read_point_cloud(message: Any) -> dict[str, Array]:
-    """Read a sensor_msgs/PointCloud2 of float32 fields.
+    """The fields of a sensor_msgs/PointCloud2: name -> (N,) float32; the field "rgb" becomes "colors", (N, 3) uint8.
 
-    Returns
-    -------
-    dict
-        Field name -> (N,) float32; the field "rgb" becomes "colors", (N, 3) uint8.
-
-    Raises
-    ------
-    ValueError
-        If a field is not a single float32.
+    Raises ValueError if a field is not a single float32.
     """
     if any(known.datatype != FLOAT32 or known.count != 1 for known in message.fields):
         raise ValueError("a point cloud must have fields of one float32 each")
@@ -175,19 +155,9 @@ def read_point_cloud(message: Any) -> dict[str, Array]:
 
 
 def read_grid_map(message: Any) -> ElevationMap:
-    """Read an axis-aligned grid_map_msgs/GridMap with a layer "elevation".
+    """All layers of an axis-aligned grid_map_msgs/GridMap with a layer "elevation".
 
-    A map with start indices in its circular buffer is unrolled.
-
-    Returns
-    -------
-    ElevationMap
-        With all layers of the message.
-
-    Raises
-    ------
-    ValueError
-        If a layer is not column-major.
+    A map with start indices in its circular buffer is unrolled. Raises ValueError if a layer is not column-major.
     """
     info, centre = message.info, message.info.pose.position
     return ElevationMap(
@@ -211,18 +181,9 @@ def read_layers(message: Any) -> dict[str, Array]:
 
 
 def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
-    """Read a nav_msgs/OccupancyGrid.
+    """Cells and reasons of a nav_msgs/OccupancyGrid.
 
-    Parameters
-    ----------
-    message : nav_msgs/OccupancyGrid
-    reasons : grid_map_msgs/GridMap, optional
-        Its `reason_map`. Without it the reason of a hazard is `REASON_NOT_RECORDED`.
-
-    Returns
-    -------
-    NavigationMap
-        Cells and reasons.
+    reasons: its `reason_map`, a grid_map_msgs/GridMap; without it the reason of a hazard is `REASON_NOT_RECORDED`.
     """
     info = message.info
     cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)

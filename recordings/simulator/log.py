@@ -24,16 +24,7 @@ ROCK_FIELDS = ("x", "y", "z", "diameter", "height", "pixels", "shown")
 
 
 def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Write the log of a traverse.
-
-    Parameters
-    ----------
-    simulation
-        The traverse.
-    out
-        The MCAP file to write.
-    progress
-        Called with (frames written, frames) after each frame.
+    """Write the log of a traverse into an MCAP file; progress: called with (frames written, frames) after each frame.
 
     Examples
     --------
