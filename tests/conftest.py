@@ -96,6 +96,30 @@ def roverflow(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Callable[..., Any]:
+    """What a command prints, `.out` and `.err`: said(exit code, its words)."""
+
+    def command(code: int, *words: object) -> Any:
+        capsys.readouterr()
+        assert roverflow(*words) == code, words
+        return capsys.readouterr()
+
+    return command
+
+
+@pytest.fixture
+def refused(said: Callable[..., Any]) -> Callable[..., str]:
+    """The one sentence by which a command refuses its words."""
+
+    def command(*words: object) -> str:
+        sentence: str = said(2, *words).err
+        assert sentence.count("\n") == 1, sentence
+        return sentence
+
+    return command
+
+
 def rewrite(
     source: Path,
     out: Path,

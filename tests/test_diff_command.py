@@ -22,16 +22,13 @@ def variant_of(traverse, tmp_path_factory):
     return make
 
 
-def test_a_run_and_the_same_run_are_equal(fast_result, variant_of, capsys):
-    assert roverflow("diff", fast_result, fast_result) == 0
-    assert roverflow("diff", fast_result, variant_of()) == 0
-    assert capsys.readouterr().out.splitlines()[-1].startswith("equal: all ")
-
-
-def test_equal_results_make_no_recording(fast_result, tmp_path, capsys):
-    assert roverflow("diff", fast_result, fast_result, "-o", tmp_path / "diff.rrd") == 0
-    assert capsys.readouterr().out.endswith(f"\n{tmp_path / 'diff.rrd'} is not written, as nothing differs\n")
-    assert not (tmp_path / "diff.rrd").exists()
+def test_a_run_and_the_same_run_are_equal_and_make_no_recording(fast_result, variant_of, tmp_path, said):
+    out = tmp_path / "diff.rrd"
+    for other in (fast_result, variant_of()):
+        equal, unwritten = said(0, "diff", fast_result, other, "-o", out).out.splitlines()[-2:]
+        assert equal.startswith("equal: all ")
+        assert unwritten == f"{out} is not written, as nothing differs"
+        assert not out.exists()
 
 
 @pytest.mark.parametrize(
@@ -45,13 +42,9 @@ def test_equal_results_make_no_recording(fast_result, tmp_path, capsys):
     ],
 )
 def test_the_first_difference_is_in_the_stream_that_a_setting_touches(
-    fast_result, variant_of, capsys, tmp_path, change, topic, measure
+    fast_result, variant_of, said, tmp_path, change, topic, measure
 ):
-    capsys.readouterr()
-    other = variant_of(change)
-    capsys.readouterr()
-    assert roverflow("diff", fast_result, other, "--json", "-o", tmp_path / "diff.rrd") == 3
-    found = json.loads(capsys.readouterr().out)
+    found = json.loads(said(3, "diff", fast_result, variant_of(change), "--json", "-o", tmp_path / "diff.rrd").out)
     first = min(stamp for name, stamp, _ in iter_decoded(fast_result, [topic]))
     assert found["first"] == [topic, first]
     assert found["topics"][topic]["worst"][measure] > 0
@@ -61,33 +54,27 @@ def test_the_first_difference_is_in_the_stream_that_a_setting_touches(
     assert (tmp_path / "diff.rrd").stat().st_size > 10_000
 
 
-def test_a_difference_is_also_a_message_that_only_one_result_has(fast_result, variant_of, tmp_path, capsys):
-    other = variant_of("McapSink.results=[disparity]")
-    assert roverflow("diff", fast_result, other) == 3
-    assert "/nav/elevation_map: 0 of 0 messages differ, " in capsys.readouterr().out
+def test_a_difference_is_also_a_message_that_only_one_result_has(fast_result, variant_of, said):
+    differences = said(3, "diff", fast_result, variant_of("McapSink.results=[disparity]")).out
+    assert "/nav/elevation_map: 0 of 0 messages differ, " in differences
 
 
-def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_result, tmp_path, capsys):
+def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_result, tmp_path, said):
     log, out = tmp_path / traverse.name, tmp_path / "out.mcap"
     log.write_bytes(traverse.read_bytes() + b"\0")  # a byte that is reported as not read
     assert roverflow("run", log, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
-    capsys.readouterr()
-    roverflow("diff", fast_result, out, "--json")
-    facts = json.loads(capsys.readouterr().out)["facts"]
+    facts = json.loads(said(3, "diff", fast_result, out, "--json").out)["facts"]
     assert list(facts) == ["log_digest"]
     assert facts["log_digest"][0] != facts["log_digest"][1]
 
 
-def test_copied_inputs_are_counted_and_not_compared(traverse, fast_result, tmp_path, capsys):
+def test_copied_inputs_are_counted_and_not_compared(traverse, fast_result, tmp_path, said):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
-    capsys.readouterr()
-    assert roverflow("diff", out, fast_result) == 0
-    assert re.search(r"^equal: all .*\n\d+ topics of the input copied in A only$", capsys.readouterr().out, re.M)
+    equal = said(0, "diff", out, fast_result).out
+    assert re.search(r"^equal: all .*\n\d+ topics of the input copied in A only$", equal, re.M)
 
 
-def test_a_log_without_results_is_refused(traverse, fast_result, tmp_path, capsys):
-    assert roverflow("diff", fast_result, traverse) == 2
-    assert "is not a result log; give two logs that roverflow run wrote" in capsys.readouterr().err
-    assert roverflow("diff", fast_result, tmp_path / "missing.mcap") == 2
-    assert "missing.mcap: No such file or directory" in capsys.readouterr().err
+def test_a_log_without_results_is_refused(traverse, fast_result, tmp_path, refused):
+    assert "is not a result log; give two logs that roverflow run wrote" in refused("diff", fast_result, traverse)
+    assert "missing.mcap: No such file" in refused("diff", fast_result, tmp_path / "missing.mcap")

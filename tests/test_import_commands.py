@@ -16,21 +16,17 @@ sinks: [{use: recordings.McapSink}]
 """
 
 
-def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, capsys):
+def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     scene, log, out = write_scene(tmp_path / "Box"), tmp_path / "box.mcap", tmp_path / "out.mcap"
-    assert roverflow("import", "middlebury", scene, log) == 0
-    output = capsys.readouterr().out.splitlines()
-    assert output[-1].endswith("run it with --set disparities=32")
+    assert said(0, "import", "middlebury", scene, log).out.endswith("run it with --set disparities=32\n")
     assert roverflow("run", log, "--set", "disparities=32", "-o", out, "--no-rrd") == 0
     (tmp_path / "matching.yaml").write_text(MATCHING)
     matching = ("-p", tmp_path / "matching.yaml", "--set", "disparity.disparities=32")
     assert roverflow("run", log, *matching, "-o", tmp_path / "matched.mcap", "--no-rrd") == 0
     scores = []
     for name in ("out", "matched"):
-        capsys.readouterr()
         paths = tmp_path / f"{name}.mcap", tmp_path / f"{name}.json"
-        assert roverflow("score", paths[0], "--truth", log, "--json", paths[1]) == 0
-        table = capsys.readouterr().out
+        table = said(0, "score", paths[0], "--truth", log, "--json", paths[1]).out
         assert all(
             word in table for word in ("bad-0.5", "bad-4", "only one camera sees", "without the leftmost 32 columns")
         )
@@ -44,25 +40,23 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, capsys):
     assert refined["density"] > matched["density"]
 
 
-def test_each_scene_of_a_folder_becomes_a_log(tmp_path, capsys):
+def test_each_scene_of_a_folder_becomes_a_log(tmp_path, said, refused):
     for name in ("Two", "One"):
         write_scene(tmp_path / "trainingF" / name)
-    assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "logs") == 0
-    output = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in output] == [
-        str(tmp_path / "logs" / f"{name}.mcap") for name in ("One", "Two")
-    ]
-    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["One.mcap", "Two.mcap"]
-    assert roverflow("import", "middlebury", tmp_path / "trainingF", tmp_path / "all.mcap") == 2
-    assert "give a folder for the logs" in capsys.readouterr().err
+    output = said(0, "import", "middlebury", tmp_path / "trainingF", tmp_path / "logs").out.splitlines()
+    logs = [tmp_path / "logs" / f"{name}.mcap" for name in ("One", "Two")]
+    assert [line.split(":")[0] for line in output] == [str(log) for log in logs]
+    assert sorted((tmp_path / "logs").iterdir()) == logs
+    why = refused("import", "middlebury", tmp_path / "trainingF", tmp_path / "all.mcap")
+    assert "give a folder for the logs" in why
 
 
-def test_a_broken_scene_does_not_stop_the_others(tmp_path, capsys):
+def test_a_broken_scene_does_not_stop_the_others(tmp_path, refused):
     for name in ("One", "Two", "Three"):
         write_scene(tmp_path / "scenes" / name)
     (tmp_path / "scenes" / "One" / "disp0GT.pfm").write_bytes(b"spoilt")
-    assert roverflow("import", "middlebury", tmp_path / "scenes", tmp_path / "logs") == 2
-    assert "1 of 3 scenes could not be imported" in capsys.readouterr().err
+    why = refused("import", "middlebury", tmp_path / "scenes", tmp_path / "logs")
+    assert "1 of 3 scenes could not be imported" in why
     assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["Three.mcap", "Two.mcap"]
 
 
@@ -75,17 +69,14 @@ def test_a_broken_scene_does_not_stop_the_others(tmp_path, capsys):
         (None, "Bex.png", "no input log of roverflow"),
     ],
 )
-def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, capsys, spoilt, out, words):
+def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, refused, spoilt, out, words):
     scene = write_scene(tmp_path / "Box")
     if out == "Bex.png":
         (tmp_path / out).write_bytes(b"a picture")
     before = (scene / "im0.png").read_bytes()
     if spoilt:
         (scene / spoilt).write_bytes(b"spoilt")
-    assert roverflow("import", "middlebury", scene, tmp_path / out) == 2
-    output = capsys.readouterr().err
-    assert words in output
-    assert output.count("\n") == 1
+    assert words in refused("import", "middlebury", scene, tmp_path / out)
     assert {path.name for path in tmp_path.iterdir()} - {"Bex.png"} == {"Box"}
     assert (scene / "im0.png").read_bytes() == before
 

@@ -18,9 +18,8 @@ from tests.conftest import FRAMES, roverflow
 from tests.recordings.sample_log import LEFT, RIGHT, TILT, dropped, write_sample
 
 
-def test_info_describes_a_log(traverse, capsys):
-    assert roverflow("info", traverse) == 0
-    output = capsys.readouterr().out
+def test_info_describes_a_log(traverse, said):
+    output = said(0, "info", traverse).out
     assert "/stereo/left/image_rect_color" in output
     assert f"{FRAMES}" in output
     verdict, command, costs, _ = output.splitlines()[-4:]
@@ -29,15 +28,14 @@ def test_info_describes_a_log(traverse, capsys):
     assert re.match(rf"  {FRAMES} frames: about \d+ s on .*; result log about \d+ MB, recording about \d+ MB; ", costs)
 
 
-def test_info_reports_why_a_run_would_refuse_the_log(traverse, capsys):
-    assert roverflow("info", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
-    output = capsys.readouterr().out
+def test_info_reports_why_a_run_would_refuse_the_log(traverse, said, refused):
+    words = (traverse, "-p", "paper", "--set", "source.left=/nix")
+    output = said(2, "info", *words).out
     _, _, why = output.partition("run -p paper: would refuse this log: ")
     why = why.splitlines()[0]
     assert why.startswith("the source's 'left' is set to /nix")
     assert output.count(why) == 1
-    assert roverflow("run", traverse, "-p", "paper", "--set", "source.left=/nix") == 2
-    assert why in capsys.readouterr().err
+    assert why in refused("run", *words)
 
 
 CAMERA_TOPICS = ("image_rect", "camera_info")
@@ -84,13 +82,12 @@ KALIBR = {"cam0": CAMERA, "cam1": {**CAMERA, "T_cn_cnm1": RIGHT_FROM_LEFT}}
 
 
 @pytest.mark.parametrize("fault", REFUSED)
-def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, tmp_path, capsys):
+def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, tmp_path, said):
     changes, file = dict(REFUSED[fault]), tmp_path / "calibration.yaml"
     copies = [changes.pop(kind, []) for kind in ("twice", "moved")]
     log = with_copies(write_sample(tmp_path / "sample.mcap", **changes), tmp_path / "log.mcap", *copies)
     file.write_text(json.dumps(KALIBR))  # JSON is YAML
-    assert roverflow("info", log) == 2
-    offered = capsys.readouterr().out.partition("what would supply it:\n")[2].splitlines()
+    offered = said(2, "info", log).out.partition("what would supply it:\n")[2].splitlines()
     commands = {line: shlex.split(line.partition("  (")[0].replace("=FILE", f"={file}")) for line in offered}
     refused = [line for line, changes in commands.items() if roverflow("info", log, *changes) != 0]
     untrue = "if /b/picture is the left camera", "right_info=/stereo/left"  # conditions that this log does not meet
@@ -98,56 +95,46 @@ def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, t
     assert refused == [line for line in offered if any(words in line for words in untrue)]
 
 
-def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_path, capsys):
+def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_path, refused):
     log, written = write_sample(tmp_path / "log.mcap"), tmp_path / "mine.yaml"
     assert roverflow("info", log, "--write-pipeline", written) == 0
     source = yaml.safe_load(written.read_text())["source"]
     assert (source["left"], source["right"], source["inclinometer"]) == (LEFT, RIGHT, TILT)
     assert roverflow("info", log, "-p", written) == 0
-    capsys.readouterr()
-    assert roverflow("info", log, "--write-pipeline", written) == 2
-    assert "exists; choose another name" in capsys.readouterr().err
+    assert "exists; choose another name" in refused("info", log, "--write-pipeline", written)
     named = write_sample(tmp_path / "named.mcap", names=("/a/picture", "/b/picture"))
     assert roverflow("info", named, "--write-pipeline", tmp_path / "other.yaml") == 2
     assert "  #   left: /a/picture\n  #   right: /b/picture\n" in (tmp_path / "other.yaml").read_text()
 
 
-def test_info_compares_the_search_range_with_the_ground_in_view(traverse, capsys):
-    assert roverflow("info", traverse, "--json") == 0
-    found = json.loads(capsys.readouterr().out)["search_range"]
+def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
+    found = json.loads(said(0, "info", traverse, "--json").out)["search_range"]
     disparities = [
         read_disparity(message) for topic, _, message in iter_decoded(traverse) if topic == "/truth/disparity"
     ]
     truth = max(float(np.nanmax(disparity)) for disparity in disparities)
     assert 0.9 * found["ground_px"] < truth < found["range_px"]
-    assert roverflow("info", traverse, "--set", "disparities=16") == 0
-    assert f"--set=disparities={found['range_px']:.0f} includes it" in capsys.readouterr().out
-    assert roverflow("info", traverse) == 0
-    assert (
-        f"fewer than the 192 disparities: --set=disparities={found['range_px']:.0f} is faster"
-        in capsys.readouterr().out
-    )
+    enough = f"--set=disparities={found['range_px']:.0f}"
+    assert f"{enough} includes it" in said(0, "info", traverse, "--set", "disparities=16").out
+    assert f"fewer than the 192 disparities: {enough} is faster" in said(0, "info", traverse).out
 
 
-def test_info_recognises_a_result_and_its_pipeline(result, capsys):
-    assert roverflow("info", result) == 0
-    output = capsys.readouterr().out
+def test_info_recognises_a_result_and_its_pipeline(result, said):
+    output = said(0, "info", result).out
     assert re.search(r"\nThis is a result of roverflow \S+: pipeline rover, run on traverse\.mcap\.\n", output)
     assert "missing" not in output
     assert output.endswith("would refuse this log: it contains results; run the log that they were made from\n")
 
 
-def test_info_of_a_cut_log_ends_incomplete(traverse, tmp_path, capsys):
+def test_info_of_a_cut_log_ends_incomplete(traverse, tmp_path, said):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(traverse.read_bytes()[: traverse.stat().st_size * 2 // 3])
-    assert roverflow("info", cut) == 3
-    assert "damaged" in capsys.readouterr().out
+    assert "damaged" in said(3, "info", cut).out
 
 
-def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, capsys):
+def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, said):
     def streams(*given, code=0):
-        assert roverflow("info", traverse, "--json", *given) == code
-        return json.loads(capsys.readouterr().out)["streams"]
+        return json.loads(said(code, "info", traverse, "--json", *given).out)["streams"]
 
     pipeline = tmp_path / "tf.yaml"
     text = (SHIPPED / "rover.yaml").read_text()
@@ -157,7 +144,7 @@ def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, capsys):
     assert "odometry" not in streams("-p", pipeline, code=2)
 
 
-def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, capsys):
+def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, said):
     def edit(topic, number, message):
         if topic in (RIGHT, TILT):
             message.header.stamp.nanosec += 8_000_000
@@ -166,16 +153,15 @@ def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, capsys):
     log, pipeline = write_sample(tmp_path / "log.mcap", edit), tmp_path / "named.yaml"
 
     def frames(*given):
-        assert roverflow("info", log, "--json", *given) == 0
-        found = json.loads(capsys.readouterr().out)["frames"]
+        found = json.loads(said(0, "info", log, "--json", *given).out)["frames"]
         return found["pairs"], found["slop_s"], found["with_tilt"], found["tilt_gap_s"]
 
     assert frames() == (0, 0.005, 4, 0.2)
     assert frames("--set", "stereo.slop=10 ms") == (5, 0.01, 4, 0.2)
     assert frames("--set", "tilt.max_gap=1 ms", "--set", "logged.max_gap=2 s") == (0, 0.005, 0, 0.001)
     for wide, output in (("5 ms", "left image has a right image"), ("10 ms", "frame has tilt readings")):
-        assert roverflow("info", log, "--set", f"stereo.slop={wide}", "--set", "tilt.max_gap=1 ms") == 0
-        last = capsys.readouterr().out.splitlines()[-1]
+        words = ("--set", f"stereo.slop={wide}", "--set", "tilt.max_gap=1 ms")
+        last = said(0, "info", log, *words).out.splitlines()[-1]
         assert last == f"run -p rover: can run on this log, but no {output} near enough in time (see frames)"
     pipeline.write_text("""
 source: {use: recordings.McapSource}
@@ -191,15 +177,13 @@ sinks: [{use: recordings.McapSink}]
     assert frames("-p", pipeline) == (5, 0.009, None, None)
 
 
-def test_info_refuses_a_source_of_another_kind(traverse, tmp_path, capsys):
+def test_info_refuses_a_source_of_another_kind(traverse, tmp_path, refused):
     pipeline = tmp_path / "toys.yaml"
-    text = """
+    pipeline.write_text("""
 source: {use: tests.flow.toys.Source}
 streams:
   both:  {use: flow.align.pair, left: left, right: right}
   twice: {use: tests.flow.toys.Scale, couple: both}
 sinks: [{use: tests.flow.toys.Keep}]
-"""
-    pipeline.write_text(text)
-    assert roverflow("info", traverse, "-p", pipeline) == 2
-    assert "tests.flow.toys.Source is not recordings.McapSource" in capsys.readouterr().err
+""")
+    assert "tests.flow.toys.Source is not recordings.McapSource" in refused("info", traverse, "-p", pipeline)

@@ -80,12 +80,10 @@ def test_without_a_state_the_map_has_only_the_frame(run, tmp_path):
     assert np.isfinite(terrain.layers["elevation"]).sum() < 0.9 * np.isfinite(wanted.layers["elevation"]).sum()
 
 
-def test_the_state_is_reported(run, tmp_path, capsys):
+def test_the_state_is_reported(run, tmp_path, said):
     log, result = run
-    out = tmp_path / "try.rrd"
-    change = ("--set", "regional_cells.max_range=4 m", "-o", out)
-    assert roverflow("try", log, "--at", AT, "--result", result, *change) == 0
-    output = capsys.readouterr().out
+    change = ("--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
+    output = said(0, "try", log, "--at", AT, "--result", result, *change).out
     assert "1 frame from 1.534 s on, after 1 frame before it" in output
     streams = "regional_cells" if log.name == "traverse.mcap" else "motion, pose, regional_cells"
     assert f"state of {streams}, regional_cells@B from {result}, of 22:13:20.513 (1700086400513000000 ns)" in output
@@ -95,12 +93,12 @@ def test_the_state_is_reported(run, tmp_path, capsys):
     assert "/nav/regional_map: 1 of 1 messages differ" in output  # that of the state is not compared
 
 
-def test_cells_of_another_size_begin_without_a_state(run, tmp_path, capsys):
+def test_cells_of_another_size_begin_without_a_state(run, tmp_path, said):
     log, result = run
     change = ("--set", "resolution=10 cm", "-o", tmp_path / "try.rrd")
-    assert roverflow("try", log, "--at", AT, "--result", result, *change) == 0
     reason = "the map of the log has cells of 0.05 m, not 0.1 m"
-    assert f"without state: regional_cells@B ({reason})" in capsys.readouterr().out
+    output = said(0, "try", log, "--at", AT, "--result", result, *change).out
+    assert f"without state: regional_cells@B ({reason})" in output
 
 
 def test_without_the_pose_of_visual_odometry_its_map_has_no_state(run, tmp_path):
@@ -146,29 +144,26 @@ def test_a_state_that_variants_share_is_made_once(run, monkeypatch):
         (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2\n"),
     ],
 )
-def test_a_result_without_the_state_of_each_frame_is_refused(traverse, option, sentence, tmp_path, capsys):
+def test_a_result_without_the_state_of_each_frame_is_refused(traverse, option, sentence, tmp_path, refused):
     result, rest = tmp_path / "out.mcap", ("-o", tmp_path / "try.rrd")
     assert roverflow("run", traverse, "-p", "fast", *SMALL, "--end", 0.7, *option, "-o", result, "--no-rrd") == 0
-    assert roverflow("try", traverse, "--at", 1, "--result", result, *SMALL, *rest) == 2
-    assert f"{result} {sentence}" in capsys.readouterr().err
+    assert f"{result} {sentence}" in refused("try", traverse, "--at", 1, "--result", result, *SMALL, *rest)
 
 
-def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, capsys):
+def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, refused):
     def later(topic, index, data):  # by an hour, in the header
         return data[:4] + struct.pack("<i", struct.unpack("<i", data[4:8])[0] + 3600) + data[8:]
 
     rest, images = (*SMALL, "-o", tmp_path / "try.rrd"), ("left/image_rect_color", "right/image_rect_color")
     other = rewrite(traverse, tmp_path / "b.mcap", lambda *one: later(*one) if one[0].endswith(images) else one[2])
-    assert roverflow("try", other, "--at", 1, "--result", fast_result, *rest) == 2
-    assert f"{other} is not the input of {fast_result}: its frames have other stamps\n" in capsys.readouterr().err
-    assert roverflow("try", traverse, "--at", 1, "--result", fast_result, "-p", "rover", *rest) == 2
-    assert f"the pipeline is that of {fast_result}; leave out -p\n" in capsys.readouterr().err
-    assert roverflow("try", traverse, "--at", 1, "--result", traverse, *rest) == 2
-    assert f"{traverse} is not a result log; give the log that roverflow run wrote" in capsys.readouterr().err
+    for log, result, more, why in (
+        (other, fast_result, (), f"{other} is not the input of {fast_result}: its frames have other stamps\n"),
+        (traverse, fast_result, ("-p", "rover"), f"the pipeline is that of {fast_result}; leave out -p\n"),
+        (traverse, traverse, (), f"{traverse} is not a result log; give the log that roverflow run wrote"),
+    ):
+        assert why in refused("try", log, "--at", 1, "--result", result, *more, *rest)
 
 
-def test_at_the_first_frame_there_is_no_state(traverse, fast_result, tmp_path, capsys):
-    assert roverflow("try", traverse, "--at", 0.5, "--result", fast_result, *SMALL, "-o", tmp_path / "try.rrd") == 0
-    assert (
-        "has no regional map or visual odometry before the instant, so no stage has a state" in capsys.readouterr().out
-    )
+def test_at_the_first_frame_there_is_no_state(traverse, fast_result, tmp_path, said):
+    output = said(0, "try", traverse, "--at", 0.5, "--result", fast_result, *SMALL, "-o", tmp_path / "try.rrd").out
+    assert "has no regional map or visual odometry before the instant, so no stage has a state" in output

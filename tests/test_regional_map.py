@@ -54,7 +54,7 @@ def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
         assert CellReason.STEP in navigation.reason
 
 
-def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tmp_path, capsys):
+def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tmp_path):
     log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
     rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
     assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
@@ -63,24 +63,22 @@ def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tm
     assert ros2.read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
 
 
-def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, capsys):
+def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, refused):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd", "--end", 0.8) == 0
     counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert not REGIONAL & set(counts)
-    assert roverflow("export", out, tmp_path / "maps") == 2
-    stderr = capsys.readouterr().err
-    assert stderr.count("\n") == 1
-    assert "contains no /nav/regional_map, only " in stderr
-    assert "--frames" in stderr
+    why = refused("export", out, tmp_path / "maps")
+    assert "contains no /nav/regional_map, only " in why
+    assert "--frames" in why
     assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
     assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == 1
 
 
-def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, capsys):
-    assert roverflow("export", result, tmp_path / "maps") == 0
+def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, said):
+    printed = said(0, "export", result, tmp_path / "maps").out
     files = sorted(path.name for path in (tmp_path / "maps").iterdir())
-    assert f"{tmp_path / 'maps'}: {len(files)} files" in capsys.readouterr().out
+    assert f"{tmp_path / 'maps'}: {len(files)} files" in printed
     assert {"elevation.tif", "hillshade.png", "navigation_map.pgm", "navigation_map.yaml", "points.ply"} <= set(files)
     with rasterio.open(tmp_path / "maps" / "frames.tif") as file:
         assert file.read(1).max() == FRAMES
@@ -114,11 +112,8 @@ def test_neighbouring_frames_join_within_their_stated_sigmas(tmp_path):
     ("where", "words"),
     [("file", "is a file; give the name of a folder"), ("gone", "cannot read"), ("", "is not empty")],
 )
-def test_an_impossible_export_is_refused_in_one_sentence(result, tmp_path, where, words, capsys):
+def test_an_impossible_export_is_refused_in_one_sentence(result, tmp_path, where, words, refused):
     (tmp_path / "file").write_text("mine")
     log = tmp_path / "gone.mcap" if where == "gone" else result
-    assert roverflow("export", log, tmp_path / where if where != "gone" else tmp_path / "maps") == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1
+    assert words in refused("export", log, tmp_path / where if where != "gone" else tmp_path / "maps")
     assert (tmp_path / "file").read_text() == "mine"

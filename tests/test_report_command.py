@@ -39,10 +39,9 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
-def test_a_report_stands_alone_and_shows_maps_frames_and_losses(result, tmp_path, capsys):
+def test_a_report_stands_alone_and_shows_maps_frames_and_losses(result, tmp_path, said):
     out = tmp_path / "out.html"
-    assert roverflow("report", result, "-o", out) == 0
-    assert f"wrote {out} (" in capsys.readouterr().out
+    assert f"wrote {out} (" in said(0, "report", result, "-o", out).out
     page = Page(out.read_text())
     assert page.outside == []
     assert out.stat().st_size < 5_000_000
@@ -74,10 +73,8 @@ def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):
 
 
 def test_two_results_stand_beside_each_other(traverse, result, tmp_path):
-    other = tmp_path / "other.mcap"
-    assert (
-        roverflow("run", traverse, *SMALL, "-o", other, "--no-rrd", "--set", "navigation_map.rover.max_step=9 cm") == 0
-    )
+    other, change = tmp_path / "other.mcap", ("--set", "navigation_map.rover.max_step=9 cm")
+    assert roverflow("run", traverse, *SMALL, "-o", other, "--no-rrd", *change) == 0
     assert roverflow("report", result, other) == 0
     page = Page(result.with_suffix(".html").read_text())
     assert "the results first differ at /nav/navigation_map" in " ".join(page.words)
@@ -94,7 +91,7 @@ def test_a_result_beside_another_is_drawn_at_the_same_stamps(result):
     assert read_facts(result, {"typical frame": (1, {})}).drawn.keys() == alone.drawn.keys()
 
 
-def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, capsys):
+def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, refused):
     right, out = "/stereo/right/image_rect_color", tmp_path / "out.mcap"
     cut = rewrite(traverse, tmp_path / "cut.mcap", lambda topic, at, data: None if (topic, at) == (right, 1) else data)
     assert roverflow("run", cut, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
@@ -102,9 +99,6 @@ def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, capsys
     row = f"<td>left</td><td>{moment(1700086400513000000)}</td><td>unmatched</td>"
     assert row in out.with_suffix(".html").read_text()
     out.with_suffix(".html").write_text("my own page")
-    assert roverflow("report", out) == 2
-    assert "exists and is no report of roverflow" in capsys.readouterr().err
-    assert roverflow("report", traverse) == 2
-    assert "is not a result log" in capsys.readouterr().err
-    assert roverflow("report", tmp_path / "missing.mcap") == 2
-    assert "missing.mcap: No such file or directory" in capsys.readouterr().err
+    assert "exists and is no report of roverflow" in refused("report", out)
+    assert "is not a result log" in refused("report", traverse)
+    assert "missing.mcap: No such file or directory" in refused("report", tmp_path / "missing.mcap")

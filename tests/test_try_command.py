@@ -11,13 +11,13 @@ import rerun as rr
 import stages
 from recordings.comparison.sweep import chart
 from recordings.comparison.text import moment
-from tests.conftest import FRAMES, SMALL, rewrite, roverflow
+from tests.conftest import FRAMES, SMALL, rewrite
 
 AT = ("--at", "0.5", "-p", "fast")
 RIGHT = "/stereo/right/image_rect_color"
 
 
-def test_stages_before_the_change_run_once(traverse, tmp_path, capsys, monkeypatch):
+def test_stages_before_the_change_run_once(traverse, tmp_path, said, monkeypatch):
     runs = dict.fromkeys(("Match", "Voxelise", "Binarise"), 0)
 
     def counting(name):
@@ -34,9 +34,8 @@ def test_stages_before_the_change_run_once(traverse, tmp_path, capsys, monkeypat
     for name in runs:
         counting(name)
     out = tmp_path / "try.rrd"
-    arguments = ("--set", "navigation_map.rover.max_step=5 cm", "-o", out)
-    assert roverflow("try", traverse, *AT, "--frames", 2, *arguments) == 0
-    output = capsys.readouterr().out
+    change = ("--set", "navigation_map.rover.max_step=5 cm", "-o", out)
+    output = said(0, "try", traverse, *AT, "--frames", 2, *change).out
     assert "stages run once, 1 again with the change\nthe change touches navigation_map\n\nA: fast as it is\n" in output
     first = re.search(r"the results first differ at /nav/navigation_map, (\S+) \((\d+) ns\)\n", output)
     assert first is not None
@@ -49,10 +48,10 @@ def test_stages_before_the_change_run_once(traverse, tmp_path, capsys, monkeypat
     assert out.stat().st_size > 10_000
 
 
-def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path, capsys):
-    values = [word for number in (16, 64) for word in ("--set", f"disparities={number}")]
-    assert roverflow("try", traverse, *AT, *values, "-o", tmp_path / "try.rrd") == 0
-    rows = [line.split() for line in capsys.readouterr().out.splitlines() if re.match(r" +[A-C] +\d", line)]
+def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path, said):
+    values = [f"--set=disparities={number}" for number in (16, 64)]
+    output = said(0, "try", traverse, *AT, *values, "-o", tmp_path / "try.rrd").out
+    rows = [line.split() for line in output.splitlines() if re.match(r" +[A-C] +\d", line)]
     errors = {row[0]: float(row[row.index("%") + 3]) for row in rows}  # bad-1
     assert errors.keys() == {"A", "B", "C"}
     assert errors["B"] > 1.5 * errors["C"]
@@ -65,19 +64,17 @@ def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path
     )
 
 
-def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, capsys):
+def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, said):
     change = ("-p", "fast", "--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
-    assert roverflow("try", traverse, "--at", "1.05", "--before", FRAMES, *change) == 0
-    output = capsys.readouterr().out
+    output = said(0, "try", traverse, "--at", "1.05", "--before", FRAMES, *change).out
     assert "1 frame from 1.034 s on, after 1 frame before it" in output
     assert "/nav/regional_map: 1 of 1 messages differ" in output
 
 
-def test_frames_before_the_instant_are_neither_compared_nor_scored(traverse, tmp_path, capsys):
+def test_frames_before_the_instant_are_neither_compared_nor_scored(traverse, tmp_path, said):
     def tried(*before):
         change = ("-p", "fast", "--set", "disparity/full.paths=8", "-o", tmp_path / "try.rrd")
-        assert roverflow("try", traverse, "--at", "1.05", *before, *change) == 0
-        output = capsys.readouterr().out
+        output = said(0, "try", traverse, "--at", "1.05", *before, *change).out
         first = re.search(r"first differ at /nav/disparity, \S+ \((\d+) ns\)", output)
         disparities = re.search(r"  /nav/disparity: .*", output)
         assert first is not None
@@ -87,27 +84,27 @@ def test_frames_before_the_instant_are_neither_compared_nor_scored(traverse, tmp
     assert tried("--before", FRAMES) == tried()
 
 
-def test_the_frames_that_were_compared_are_counted(traverse, tmp_path, capsys):
-    assert roverflow("try", traverse, "--at", "1.05", "--frames", 99, "-p", "fast", *SMALL, "-o", tmp_path / "b") == 0
-    output = capsys.readouterr().out
+def test_the_frames_that_were_compared_are_counted(traverse, tmp_path, said):
+    words = ("--at", "1.05", "--frames", 99, "-p", "fast", *SMALL, "-o", tmp_path / "b")
+    output = said(0, "try", traverse, *words).out
     assert "2 frames from 1.034 s on: " in output
     assert "\nnote: the log has only 2 frames from there on, not 99\n" in output
 
 
-def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_path, capsys):
+def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_path, said, refused):
     log = rewrite(traverse, tmp_path / "a.mcap", lambda *one: None if one[0] == RIGHT and one[1] == 1 else one[2])
-    assert roverflow("try", log, "--at", "0.5", "--frames", 3, "-p", "fast", *SMALL, "-o", tmp_path / "b") == 0
-    output = capsys.readouterr().out
+    words = ("-p", "fast", *SMALL, "-o", tmp_path / "b")
+    output = said(0, "try", log, "--at", "0.5", "--frames", 3, *words).out
     assert "2 frames from 0.534 s on: " in output
     assert "\nnote: 1 frame gave no result; roverflow run --start " in output
-    assert roverflow("try", log, "--at", "1.05", "-p", "fast", *SMALL, "-o", tmp_path / "c") == 2
-    assert "no frame went through at 1.034 s: left unmatched; roverflow run --start " in capsys.readouterr().err
+    why = refused("try", log, "--at", "1.05", *words)
+    assert "no frame went through at 1.034 s: left unmatched; roverflow run --start " in why
 
 
-def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, capsys):
+def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, said):
     out = tmp_path / "try.rrd"
-    assert roverflow("try", traverse, *AT, "--set", "navigation_map.rover.max_step=20 cm", "-o", out) == 0
-    assert "\nthe change has no effect on 1 frame, so there is no recording to write\n" in capsys.readouterr().out
+    output = said(0, "try", traverse, *AT, "--set", "navigation_map.rover.max_step=20 cm", "-o", out).out
+    assert "\nthe change has no effect on 1 frame, so there is no recording to write\n" in output
     assert not out.exists()
 
 
@@ -123,6 +120,5 @@ def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, capsys)
         ),
     ],
 )
-def test_what_cannot_be_tried_is_refused(traverse, tmp_path, capsys, arguments, sentence):
-    assert roverflow("try", traverse, *arguments, "-o", tmp_path / "try.rrd") == 2
-    assert sentence in capsys.readouterr().err
+def test_what_cannot_be_tried_is_refused(traverse, tmp_path, refused, arguments, sentence):
+    assert sentence in refused("try", traverse, *arguments, "-o", tmp_path / "try.rrd")

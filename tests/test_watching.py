@@ -18,9 +18,9 @@ from tests.viewers import answers, send, viewer, wait_for, wait_for_bytes
 FRAME_BYTES = 100_000  # fewer than a frame of the traverse has in the recording
 
 
-def test_watching_needs_the_recording(traverse, tmp_path, capsys):
-    assert roverflow("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--view") == 2
-    assert "watching needs the recording; leave out --no-rrd" in capsys.readouterr().err
+def test_watching_needs_the_recording(traverse, tmp_path, refused):
+    why = refused("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--view")
+    assert "watching needs the recording; leave out --no-rrd" in why
 
 
 def is_the_same(out, result):
@@ -46,13 +46,11 @@ def port_of(server):
     return int(server.args[server.args.index("--port") + 1])
 
 
-def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, capsys, monkeypatch):
+def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, said, monkeypatch):
     replaced(monkeypatch, lambda command: [sys.executable, "-c", "raise SystemExit(1)"])
     out = tmp_path / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--view") == 0
-    assert (
-        f"No viewer (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in capsys.readouterr().out
-    )
+    printed = said(0, "run", traverse, *SMALL, "-o", out, "--view").out
+    assert f"No viewer (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in printed
     assert is_the_same(out, result)
 
 
@@ -89,10 +87,9 @@ def test_a_viewer_that_stops_or_dies_changes_nothing(traverse, result, tmp_path,
 
 
 @pytest.mark.slow
-def test_a_served_run_writes_the_same_result_and_its_page_ends(traverse, result, tmp_path, capsys, monkeypatch):
+def test_a_served_run_writes_the_same_result_and_its_page_ends(traverse, result, tmp_path, said, monkeypatch):
     started, out = replaced(monkeypatch, lambda command: command), tmp_path / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--serve") == 0
-    assert "watch the run at http://127.0.0.1:" in capsys.readouterr().out
+    assert "watch the run at http://127.0.0.1:" in said(0, "run", traverse, *SMALL, "-o", out, "--serve").out
     assert is_the_same(out, result)
     assert not answers(port_of(started[0]))
 

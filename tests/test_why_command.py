@@ -87,13 +87,11 @@ def test_only_stages_before_the_map_run_and_the_log_is_not_surveyed_again(traver
     assert why(fast_result, AT, cell=(x, y), log=traverse).recorded == Cell.HAZARD
 
 
-def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, stamp, tmp_path, capsys):
+def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, stamp, tmp_path, said):
     (x, y), *_ = places(fast_result, stamp, Cell.HAZARD, 1)
     out, log = tmp_path / "why.png", ("--log", traverse)
-    capsys.readouterr()
     for _ in range(2):  # the second picture replaces the first
-        assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", *log, "-o", out) == 0
-    output = capsys.readouterr().out
+        output = said(0, "why", fast_result, "--at", AT, f"--cell={x},{y}", *log, "-o", out).out
     assert f"cell ({x:.3f}, {y:.3f}) m at {moment(stamp)}: hazard, reason " in output
     assert re.search(r"\n  step .*; limit 0.17 m = rover.max_step 0.2 - height_margin 0.03\n", output)
     assert "\n  drop                     none (only hidden cells have one)\n" in output
@@ -104,27 +102,24 @@ def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, s
     assert ((picture[..., 2] > 200) & (picture[..., 1] < 80) & (picture[..., 0] > 150)).sum() > 20
 
 
-def test_what_cannot_be_explained_is_refused(traverse, fast_result, capsys):
-    def refusal(*arguments):
-        assert roverflow("why", fast_result, "--at", AT, *arguments) == 2
-        return capsys.readouterr().err
-
-    assert "traverse.mcap, is not beside it; give it with --log" in refusal("--cell", "1,1")
-    assert "is outside the map, which has x " in refusal("--cell", "99,1", "--log", traverse)
-    assert "is outside the image of 320x240" in refusal("--pixel", "999,1", "--log", traverse)
-    other = refusal("--cell", "1,1", "--log", traverse, "--map", "nix")
-    assert "the pipeline has no navigation map 'nix', only navigation_map, regional_navigation_map" in other
+def test_what_cannot_be_explained_is_refused(traverse, fast_result, refused):
+    for words, why_not in (
+        (("--cell", "1,1"), "traverse.mcap, is not beside it; give it with --log"),
+        (("--cell", "99,1", "--log", traverse), "is outside the map, which has x "),
+        (("--pixel", "999,1", "--log", traverse), "is outside the image of 320x240"),
+        (("--cell", "1,1", "--log", traverse, "--map", "nix"), "has no navigation map 'nix', only navigation_map, reg"),
+    ):
+        assert why_not in refused("why", fast_result, "--at", AT, *words)
 
 
-def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result, stamp, capsys):
+def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result, stamp, said):
     grid = messages(fast_result, "/nav/navigation_map")[stamp]
     terrain = read_grid_map(messages(fast_result, "/nav/elevation_map")[stamp])
     unsure = read_occupancy_grid(grid, messages(fast_result, "/nav/navigation_map/reason")[stamp]).reason == 9
     for few, cells in ((True, terrain.layers["count"] < 1), (False, terrain.layers["count"] >= 1)):
         row, col = np.argwhere(unsure & cells)[0]
         x, y = (terrain.origin[axis] + (place + 0.5) * terrain.resolution for axis, place in ((0, col), (1, row)))
-        assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse) == 0
-        output = capsys.readouterr().out
+        output = said(0, "why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse).out
         (because,) = re.findall(r"\nnot free because: (.+)\n", output)
         assert "unknown, reason unsure\n" in output
         assert ("fewer points than min_points" in because) == few
@@ -132,53 +127,49 @@ def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result
     assert not why(fast_result, AT, cell=(x, y), log=traverse).doubts
 
 
-def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, capsys):
+def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, said):
     grid = read_occupancy_grid(messages(fast_result, "/nav/navigation_map")[stamp])
     x, y = (start + 0.5 * grid.resolution for start in grid.origin)
-    assert roverflow("why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse) == 0
-    assert "unknown, reason unobserved\nno height, so no limit applies\n" in capsys.readouterr().out
+    output = said(0, "why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse).out
+    assert "unknown, reason unobserved\nno height, so no limit applies\n" in output
 
 
 @pytest.mark.parametrize("regional", [(), ("--map", "regional_navigation_map")])
-def test_a_log_of_other_stamps_is_not_taken_for_the_input(traverse, fast_result, tmp_path, capsys, regional):
+def test_a_log_of_other_stamps_is_not_taken_for_the_input(traverse, fast_result, tmp_path, refused, regional):
     def later(topic, index, data):
         return data[:4] + struct.pack("<i", struct.unpack("<i", data[4:8])[0] + 3600) + data[8:]
 
     images = ("/stereo/left/image_rect_color", "/stereo/right/image_rect_color")
     other = rewrite(traverse, tmp_path / "b.mcap", lambda *one: later(*one) if one[0] in images else one[2])
     words = ("--at", AT, "--cell", "3,0", *regional)
-    assert roverflow("why", fast_result, *words, "--log", other) == 2
-    said = capsys.readouterr().err
-    assert f"b.mcap is not the input of {fast_result}: its frames have other stamps; give traverse.mcap\n" in said
+    sentence = refused("why", fast_result, *words, "--log", other)
+    assert f"b.mcap is not the input of {fast_result}: its frames have other stamps; give traverse.mcap\n" in sentence
     result = shutil.copy(fast_result, tmp_path / "out.mcap")
     other.rename(tmp_path / "traverse.mcap")
-    assert roverflow("why", result, *words) == 2
-    said = capsys.readouterr().err
-    assert "other stamps (taken for the input because the result names traverse.mcap; give --log)" in said
+    guessed = "other stamps (taken for the input because the result names traverse.mcap; give --log)"
+    assert guessed in refused("why", result, *words)
 
 
-def test_a_log_of_the_same_stamps_and_other_content_is_noted(traverse, fast_result, tmp_path, capsys):
-    other = rewrite(traverse, tmp_path / "other.mcap", lambda *one: one[2], chunk_size=1 << 16)
-    assert roverflow("why", fast_result, "--at", AT, "--cell", "3,0", "--log", other) == 0
+def test_a_log_of_the_same_stamps_and_other_content_is_noted(traverse, fast_result, tmp_path, said, refused):
+    other, none = rewrite(traverse, tmp_path / "other.mcap", lambda *one: one[2], chunk_size=1 << 16), tmp_path / "none"
+    words = ("why", fast_result, "--at", AT, "--cell", "3,0", "--log")
     noted = f"note: {other} is another form of the input of {fast_result}, or another log with its stamps\n"
-    assert noted in capsys.readouterr().out
-    assert roverflow("why", fast_result, "--at", AT, "--cell", "3,0", "--log", tmp_path / "none.mcap") == 2
-    assert f"there is no log {tmp_path / 'none.mcap'}, which --log names\n" in capsys.readouterr().err
+    assert noted in said(0, *words, other).out
+    assert f"there is no log {none}, which --log names\n" in refused(*words, none)
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9999])
-def test_a_result_that_was_cut_is_said_to_be_incomplete(traverse, fast_result, share, tmp_path, capsys):
+def test_a_result_that_was_cut_is_said_to_be_incomplete(traverse, fast_result, share, tmp_path, said):
     data, cut = fast_result.read_bytes(), tmp_path / "out.mcap"
+    words = ("--at", 0.6, "--cell", "3,0", "--log", traverse)
     cut.write_bytes(data[: int(share * len(data))])
-    assert roverflow("why", cut, "--at", 0.6, "--cell", "3,0", "--log", traverse) == 0
-    notes = [line for line in capsys.readouterr().out.splitlines() if line.startswith("note: ")]
+    notes = [line for line in said(0, "why", cut, *words).out.splitlines() if line.startswith("note: ")]
     why = "its end is missing" if share > 0.99 else "the log is cut or damaged"
     assert [note.partition(" at byte ")[0] for note in notes] == [f"note: {cut} is incomplete: {why}"]
-    assert roverflow("why", fast_result, "--at", 0.6, "--cell", "3,0", "--log", traverse) == 0
-    assert "note: " not in capsys.readouterr().out
+    assert "note: " not in said(0, "why", fast_result, *words).out
 
 
-def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, capsys):
+def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, said, refused):
     grids = messages(fast_result, "/nav/regional_navigation_map")
     end, grid = max(grids), read_occupancy_grid(grids[max(grids)])
     layers = read_grid_map(messages(fast_result, "/nav/regional_map")[end]).layers
@@ -186,24 +177,21 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, cap
     row, col = np.unravel_index(np.nanargmax(seen), seen.shape)
     x, y = ((place + 0.5) * grid.resolution + start for place, start in zip((col, row), grid.origin, strict=True))
     late = ("--at", 60, f"--cell={x},{y}", "--map", "regional_navigation_map", "--log", traverse)
-    assert roverflow("why", fast_result, *late) == 0
-    said = capsys.readouterr().out
-    assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {moment(end)}: free, reason clear" in said
-    assert said.startswith("note: --at is after the last 'regional_navigation_map', which is explained; it is at 1.5")
+    output = said(0, "why", fast_result, *late).out
+    assert f"cell ({x:.3f}, {y:.3f}) m in 'odom', map of {moment(end)}: free, reason clear" in output
+    assert output.startswith("note: --at is after the last 'regional_navigation_map', which is explained; it is at 1.5")
     found = why_regional(fast_result, 60, (x, y), log=traverse)
     assert found.layers["frames"] == len(found.frames) == FRAMES
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
-    assert said.count(" points, height ") == FRAMES
+    assert output.count(" points, height ") == FRAMES
     assert why_regional(fast_result, np.datetime64(end, "ns"), (x, y)).frames == found.frames  # without input
-    assert f"frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): {FRAMES}\n" in said
+    assert f"frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): {FRAMES}\n" in output
     assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
-    assert roverflow("why", fast_result, *late[:2], "--pixel", "9,9", *late[3:]) == 2
-    assert "is a regional map: give --cell" in capsys.readouterr().err
-    assert roverflow("why", fast_result, *late[:2], "--cell", "999,1", *late[3:]) == 2
-    assert "outside the regional map in 'odom'" in capsys.readouterr().err
+    for cell, why_not in (("--pixel=9,9", "is a regional map: give --cell"), ("--cell=999,1", "map in 'odom'")):
+        assert why_not in refused("why", fast_result, *late[:2], cell, *late[3:])
 
 
-def test_a_regional_map_without_the_frame_at_the_instant_says_so(traverse, fast_result, tmp_path, capsys):
+def test_a_regional_map_without_the_frame_at_the_instant_says_so(traverse, fast_result, tmp_path, said):
     *_, before, last = messages(fast_result, "/nav/pose")
 
     def tip(index, message):
@@ -215,11 +203,9 @@ def test_a_regional_map_without_the_frame_at_the_instant_says_so(traverse, fast_
 
     log = rewrite(traverse, tmp_path / "in.mcap", edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", tip))
     assert roverflow("run", log, "-p", "fast", *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd") == 3
-    capsys.readouterr()
     words = ("--at", f"{last}", "--cell", "3,0", "--map", "regional_navigation_map")
-    assert roverflow("why", tmp_path / "out.mcap", *words) == 0
     until = f"note: the 'regional_navigation_map' from --at on has only frames up to {moment(before)}\n"
-    assert capsys.readouterr().out.startswith(until)
+    assert said(0, "why", tmp_path / "out.mcap", *words).out.startswith(until)
 
 
 def test_transforms_for_viewers_do_not_hide_the_frames_that_saw_a_cell(traverse, tmp_path):

@@ -88,11 +88,10 @@ def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, capsys):
+def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, said, refused):
     out, plain = tmp_path / "out", tmp_path / "plain.mcap"
     words = ("fleet", logs, "--out", out, *PIPELINE, "--processes", 1)
-    assert roverflow(*words) == 3
-    printed = capsys.readouterr().out
+    printed = said(3, *words).out
     assert "4 logs: 0 done before, 4 to run (4 new)" in printed
     assert "junk: unusable: " in printed
     for name in ("a", "b", "site/c"):
@@ -102,26 +101,21 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, c
         "a": "done", "b": "done", "site/c": "done", "junk": "unusable"
     }  # fmt: skip
     (out / "a-nav.mcap").unlink()
-    capsys.readouterr()
-    assert roverflow(*words) == 3
-    assert "4 logs: 3 done before, 1 to run (1 its result is missing)" in capsys.readouterr().out
+    assert "4 logs: 3 done before, 1 to run (1 its result is missing)" in said(3, *words).out
     assert (out / "a-nav.mcap").is_file()
-    assert roverflow("list", out, "--where", "verdict = 'COMPLETE'", "--sort", "frames DESC", "--json") == 0
-    assert next(row["name"] for row in json.loads(capsys.readouterr().out)) == "b"
-    assert roverflow("score", out) == 0
-    table = capsys.readouterr().out.splitlines()
+    listed = said(0, "list", out, "--where", "verdict = 'COMPLETE'", "--sort", "frames DESC", "--json").out
+    assert json.loads(listed)[0]["name"] == "b"
+    table = said(0, "score", out).out.splitlines()
     assert [line.split()[0] for line in table] == ["fast", "log", "a", "b", "site/c", "mean"]
     assert json.loads(rows_of(out)["a"]["scores"])["density"] > 0
-    assert roverflow("fleet", "--out", out, "--watch") == 0
-    assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in capsys.readouterr().out
-    assert roverflow("list", out, "--where", "verdict != 'COMPLETE'", "--csv") == 0
-    assert [line.split(",")[0] for line in capsys.readouterr().out.splitlines()] == ["name", "junk"]
+    assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in said(0, "fleet", "--out", out, "--watch").out
+    listed = said(0, "list", out, "--where", "verdict != 'COMPLETE'", "--csv").out
+    assert [line.split(",")[0] for line in listed.splitlines()] == ["name", "junk"]
     assert roverflow("report", out) == 0
     page = (out / "report.html").read_text()
     assert "<td>site/c</td><td>COMPLETE</td><td>1 of 1</td>" in page
     assert "<td>junk</td><td>unusable</td>" in page
-    assert roverflow("list", out, "--where", "nonsense") == 2
-    assert "its columns are name, log, bytes" in capsys.readouterr().err
+    assert "its columns are name, log, bytes" in refused("list", out, "--where", "nonsense")
 
 
 def test_a_progress_file_that_is_just_being_written_is_no_stall(logs, tmp_path):
@@ -150,10 +144,10 @@ def test_a_log_keeps_its_name_and_no_other_log_takes_it(logs, tmp_path):
         jobs_of([str(moved)], tmp_path, [row])
 
 
-def test_a_second_fleet_in_the_folder_is_refused(logs, tmp_path, capsys):
+def test_a_second_fleet_in_the_folder_is_refused(logs, tmp_path, refused):
     with Catalogue(tmp_path, create=True).held():
-        assert roverflow("fleet", logs / "a.mcap", "--out", tmp_path, *PIPELINE) == 2
-    assert f"another roverflow fleet runs in {tmp_path}; --watch shows it" in capsys.readouterr().err
+        why = refused("fleet", logs / "a.mcap", "--out", tmp_path, *PIPELINE)
+    assert f"another roverflow fleet runs in {tmp_path}; --watch shows it" in why
     assert Catalogue(tmp_path).is_held() is False
 
 
@@ -163,11 +157,11 @@ def test_an_empty_log_that_ends_first_leaves_all_time(capsys):
     assert capsys.readouterr().out.startswith("1 of 2: empty: unusable: it is empty; 0 frames so far, 0.00 GB left")
 
 
-def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, capsys):
+def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, said):
     catalogue = Catalogue(tmp_path, create=True)
     catalogue.put("a", {"state": "running", "bytes": 9})
-    assert roverflow("fleet", "--out", tmp_path, "--watch") == 3
-    assert "no process runs this fleet, 1 log left; the same command continues" in capsys.readouterr().out
+    printed = said(3, "fleet", "--out", tmp_path, "--watch").out
+    assert "no process runs this fleet, 1 log left; the same command continues" in printed
 
 
 def test_a_worker_that_stays_forgets_the_stages_of_an_earlier_fleet(logs, tmp_path):
@@ -220,7 +214,7 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
 
 
 @pytest.mark.slow
-def test_logs_that_end_or_stop_their_workers_leave_the_others_alone(logs, tmp_path, capsys):
+def test_logs_that_end_or_stop_their_workers_leave_the_others_alone(logs, tmp_path, said):
     home, out = tmp_path / "home", tmp_path / "out"
     home.mkdir()
     for name, width in (("dies", 160), ("hangs", 176), ("grows", 192), ("sound", 208), ("sound2", 208)):
@@ -231,6 +225,4 @@ def test_logs_that_end_or_stop_their_workers_leave_the_others_alone(logs, tmp_pa
     assert roverflow(*words) == 3
     states = {name: row["state"] for name, row in rows_of(out).items()}
     assert states == {"dies": "killed", "hangs": "hung", "grows": "killed", "sound": "done", "sound2": "done"}
-    capsys.readouterr()
-    assert roverflow(*words) == 3
-    assert "5 logs: 5 done before, 0 to run" in capsys.readouterr().out
+    assert "5 logs: 5 done before, 0 to run" in said(3, *words).out
