@@ -10,8 +10,8 @@ from stages.matching.kernels.census import census_costs_reference, census_refere
 from stages.matching.kernels.matching_inputs import NO_PRIOR, MatchingInputs, matching_inputs
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
 from tests.conftest import slow
+from tests.stages.matching.pairs import textured
 from tests.stages.matching.test_census import params_of
-from tests.stages.matching.test_match_opencv import textured
 
 
 @njit

@@ -11,7 +11,7 @@ from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.sgm_params import SgmParams
 from tests.conftest import slow
-from tests.stages.matching.test_match_opencv import textured
+from tests.stages.matching.pairs import textured
 
 
 @njit

@@ -18,8 +18,9 @@ from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages.data import Disparity, PixelOrigin, StereoFrame
 from stages.matching.match import COSTS, LEADS, Match
+from stages.matching.match_opencv import MatchOpenCV
 from tests.bench.stereo_scores import load_scene, rows_filled
-from tests.stages.matching.test_match_opencv import frame_of, slanted_pair, textured
+from tests.stages.matching.pairs import frame_of, slanted_pair, textured
 
 ROOT = Path(__file__).parents[3]
 REASONS = range(PixelOrigin.OUT_OF_VIEW, PixelOrigin.BLANK + 1)
@@ -35,16 +36,28 @@ def slope():
     return slanted_pair()
 
 
-@pytest.mark.parametrize("cost", COSTS)
-@pytest.mark.parametrize("paths", [4, 8])
-def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(slope, cost, paths):
+def in_colour(frame):
+    return replace(frame, left=np.dstack([frame.left] * 3), right=np.dstack([frame.right] * 3))
+
+
+MATCHERS = Match(disparities=48), MatchOpenCV(disparities=48)
+
+
+@pytest.mark.parametrize(("match", "border", "share", "largest"), [
+    *((Match(disparities=48, cost=cost, paths=paths), 2, share, 0.11)
+      for cost in COSTS for paths, share in ((4, 0.85), (8, 0.95))),
+    *((MatchOpenCV(disparities=48, paths=paths, color=color), 0, 0.95, 0.15)
+      for color in (False, True) for paths in (3, 5, 8)),
+])  # fmt: skip
+def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(slope, match, border, share, largest):
     frame, truth = slope
-    result = Match(disparities=48, cost=cost, paths=paths)(frame)
-    visible = np.arange(320) >= truth + 2
+    frame = in_colour(frame) if getattr(match, "color", False) else frame
+    result = match(frame)
+    visible = np.arange(320) >= truth + border
     known = np.isfinite(result.pixels)
-    assert known[visible].mean() > (0.95 if paths == 8 else 0.85)
+    assert known[visible].mean() > share
     error = np.abs(result.pixels - truth)[known & visible]
-    assert np.median(error) < 0.11
+    assert np.median(error) < largest
     assert (error > 1).mean() < 0.01
     assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
 
@@ -74,9 +87,11 @@ def test_costs_are_kept_if_asked_for_and_change_nothing_else(slope, near):
     np.testing.assert_array_equal((next_lowest - lowest)[known], lead[known])
 
 
-def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(slope):
+@pytest.mark.parametrize("match", MATCHERS)
+def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(slope, match):
     frame, truth = slope
-    pixels = Match(disparities=48)(frame).pixels
+    pixels = match(frame).pixels
+    assert not (pixels > np.arange(320)).any()
     margin = np.s_[:, :48]
     visible, hidden = (np.arange(320) >= truth + 3)[margin], (np.arange(320) < truth - 3)[margin]
     assert np.isfinite(pixels[margin])[visible].mean() > 0.9
@@ -93,13 +108,14 @@ def test_a_range_that_starts_elsewhere_finds_the_same(slope):
         assert np.median(np.abs(pixels - truth[inside])[known]) < 0.12
 
 
-def test_a_negative_range_finds_points_beyond_infinity(slope):
+@pytest.mark.parametrize(("match", "largest"), [*zip(MATCHERS, (0.12, 0.15), strict=True)])
+def test_a_negative_range_finds_points_beyond_infinity(slope, match, largest):
     frame, truth = slope
     crossed = frame_of(frame.left[:, ::-1].copy(), frame.right[:, ::-1].copy())
-    pixels = Match(disparities=48, min_disparity=-47)(crossed).pixels
+    pixels = replace(match, min_disparity=-47)(crossed).pixels
     known = np.isfinite(pixels)
     assert known.mean() > 0.85
-    assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.12
+    assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < largest
 
 
 def test_what_lies_beyond_max_depth_is_neither_searched_nor_made_up(slope):
@@ -144,23 +160,24 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
     assert np.nanmax(Match(disparities=24, out_of_range="prior")(frame, guess).pixels) < 24.5
 
 
-def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope):
+@pytest.mark.parametrize(("match", "border", "largest"), [*zip(MATCHERS, (2, 0), (0.12, 0.15), strict=True)])
+def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope, match, border, largest):
     frame, truth = slope
     deep = frame_of(frame.left.astype(np.uint16) * 9 + 700, frame.right.astype(np.uint16) * 9 + 700)
-    colour = frame_of(np.dstack([frame.left] * 3), np.dstack([frame.right] * 3))
-    assert same(Match(disparities=48)(colour), Match(disparities=48)(frame))
-    pixels = Match(disparities=48)(deep).pixels
+    assert same(match(in_colour(frame)), match(frame))
+    pixels = match(deep).pixels
     known = np.isfinite(pixels)
-    assert known[np.arange(320) >= truth + 2].mean() > 0.95
-    assert np.median(np.abs(pixels - truth)[known]) < 0.12
+    assert known[np.arange(320) >= truth + border].mean() > 0.95
+    assert np.median(np.abs(pixels - truth)[known]) < largest
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("level", [0, 255])
-def test_a_uniform_image_has_no_disparity(dtype, level):
+@pytest.mark.parametrize("match", MATCHERS)
+def test_a_uniform_image_has_no_disparity(dtype, level, match):
     image = np.full((64, 96), level, dtype)
     for minimum in (-9, 0, 7):
-        result = Match(disparities=32, min_disparity=minimum)(frame_of(image, image))
+        result = replace(match, disparities=32, min_disparity=minimum)(frame_of(image, image))
         assert np.isnan(result.pixels).all()
         assert (result.source == PixelOrigin.BLANK).all()
         assert (result.confidence == 0).all()
@@ -324,7 +341,7 @@ DIGEST = """
 import hashlib, sys
 sys.path.insert(0, {root!r})
 from stages import Match
-from tests.stages.matching.test_match_opencv import slanted_pair
+from tests.stages.matching.pairs import slanted_pair
 frame, _ = slanted_pair(height=64, width=100)
 results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
 results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]

@@ -1,7 +1,6 @@
-"""Matching: right on a synthetic truth, silent where there is no evidence, the same bits in every thread."""
+"""MatchOpenCV: disparities in range and in view, the same bits in every thread; test_match has what all matchers do."""
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,86 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data import PixelOrigin, StereoCamera, StereoFrame
+from stages.data import PixelOrigin
 from stages.matching.match_opencv import MatchOpenCV
-
-
-def frame_of(left, right):
-    height, width = left.shape[:2]
-    return StereoFrame(3, left, right, StereoCamera(300, 300, width / 2, height / 2, 0.1, width, height))
-
-
-def textured(height, width, seed=0):
-    noise = np.random.default_rng(seed).uniform(0, 255, (height, width)).astype(np.float32)
-    smooth = cv2.GaussianBlur(noise, (0, 0), 1.2)
-    return np.clip((smooth - 127) * 3 + 127, 0, 255)
-
-
-def slanted_pair(height=200, width=320, near=34.0, far=6.0):
-    """A pair that sees a plane, d growing downwards from `far` to `near`, and its true disparities (H, W)."""
-    wide = textured(height, width + 80)
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    disparity = far + (near - far) * y / (height - 1)
-    right = cv2.remap(wide, x + 40, y, cv2.INTER_CUBIC)
-    left = cv2.remap(wide, x + 40 - disparity, y, cv2.INTER_CUBIC)  # x_right = x_left - d
-    left, right = (np.round(image).clip(0, 255).astype(np.uint8) for image in (left, right))
-    return frame_of(left, right), disparity
-
-
-@pytest.mark.parametrize("paths", [3, 5, 8])
-@pytest.mark.parametrize("color", [False, True])
-def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(paths, color):
-    frame, truth = slanted_pair()
-    if color:
-        frame = replace(frame, left=np.dstack([frame.left] * 3), right=np.dstack([frame.right] * 3))
-    result = MatchOpenCV(disparities=48, paths=paths, color=color)(frame)
-    visible = np.arange(320) >= truth
-    known = np.isfinite(result.pixels)
-    assert known[visible].mean() > 0.95
-    error = np.abs(result.pixels - truth)[known & visible]
-    assert np.median(error) < 0.15
-    assert (error > 1).mean() < 0.01
-    assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
-
-
-def test_the_left_margin_is_matched_only_where_the_right_image_sees_it():
-    frame, truth = slanted_pair()
-    pixels = MatchOpenCV(disparities=48)(frame).pixels
-    margin = np.s_[:, :48]
-    visible = (np.arange(320) >= truth + 3)[margin]
-    assert np.isfinite(pixels[margin])[visible].mean() > 0.9
-    hidden = (np.arange(320) < truth - 3)[margin]
-    assert np.isfinite(pixels[margin])[hidden].mean() < 0.05
-    known = np.isfinite(pixels)
-    assert (pixels <= np.arange(320))[known].all()
-
-
-def test_a_negative_range_finds_points_beyond_infinity():
-    frame, truth = slanted_pair()
-    crossed = frame_of(frame.left[:, ::-1].copy(), frame.right[:, ::-1].copy())
-    pixels = MatchOpenCV(disparities=48, min_disparity=-47)(crossed).pixels
-    known = np.isfinite(pixels)
-    assert known.mean() > 0.85
-    assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < 0.15
-
-
-def test_sixteen_bit_images_match_like_eight_bit_ones():
-    frame, truth = slanted_pair()
-    deep = frame_of(frame.left.astype(np.uint16) * 9 + 700, frame.right.astype(np.uint16) * 9 + 700)
-    pixels = MatchOpenCV(disparities=48)(deep).pixels
-    known = np.isfinite(pixels)
-    assert known[np.arange(320) >= truth].mean() > 0.95
-    assert np.median(np.abs(pixels - truth)[known]) < 0.15
-
-
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("level", [0, 255])
-def test_a_uniform_image_has_no_disparity(dtype, level):
-    image = np.full((64, 96), level, dtype)
-    result = MatchOpenCV(disparities=32)(frame_of(image, image))
-    assert np.isnan(result.pixels).all()
-    assert (result.source == PixelOrigin.BLANK).all()
-    assert (result.confidence == 0).all()
+from tests.stages.matching.pairs import frame_of, slanted_pair, textured
 
 
 @settings(max_examples=12, deadline=None)

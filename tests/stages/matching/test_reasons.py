@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from stages import Disparity, LeftRightCheck, Match, MatchOpenCV, PixelOrigin, known
 from stages.data import Array
-from tests.stages.matching.test_match_opencv import slanted_pair, textured
+from tests.stages.matching.pairs import slanted_pair, textured
 
 REASONS = range(PixelOrigin.OUT_OF_VIEW, PixelOrigin.BLANK + 1)
 

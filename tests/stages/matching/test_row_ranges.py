@@ -28,9 +28,9 @@ from stages.matching.kernels.selection import costs_reference, select_reference
 from stages.matching.kernels.semiglobal import match
 from stages.matching.kernels.texture import contrast, drop_unmatchable_reference
 from stages.matching.match import Match
+from tests.stages.matching.pairs import slanted_pair
 from tests.stages.matching.test_census import params_of
 from tests.stages.matching.test_match import same
-from tests.stages.matching.test_match_opencv import slanted_pair
 from tests.stages.matching.test_sgm_local import views
 
 

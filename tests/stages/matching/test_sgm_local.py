@@ -17,8 +17,8 @@ from stages.matching.kernels.sgm_local import (
     match_windows_reference,
     windows_around,
 )
+from tests.stages.matching.pairs import textured
 from tests.stages.matching.test_census import params_of
-from tests.stages.matching.test_match_opencv import textured
 
 
 def views(height, columns, disparity):
