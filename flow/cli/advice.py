@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from flow.cli.outputs import default_result
+from flow.cli.report import duration
 from flow.config.loader import pipeline_file
 from flow.contracts import counted
 from flow.errors import UsageError
@@ -105,7 +106,7 @@ def _costs(pipeline: str, description: Mapping[str, Any]) -> str:
     seconds, log, recording = (
         frames * (fixed + each * megapixels) for fixed, each in (_SECONDS[pipeline], _LOG_MB, _RECORDING_MB)
     )
-    time = _duration(_STARTING_SECONDS + seconds / cores)
+    time = duration(_STARTING_SECONDS + seconds / cores)
     return (
         f"{counted(frames, 'frame')}: about {time} on {counted(cores, 'core')}; result log about {_size(log)}, "
         f"recording about {_size(recording)}"
@@ -134,16 +135,6 @@ def _flow(value: Any) -> str:
 
 def _note(condition: str) -> str:
     return f"  ({condition})" if condition else ""
-
-
-def _duration(seconds: float) -> str:
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 120
-        else f"{seconds / 60:.0f} min"
-        if seconds < 7200
-        else f"{seconds / 3600:.1f} h"
-    )
 
 
 def _size(megabytes: float) -> str:

@@ -286,14 +286,14 @@ def _place(cloud: PointCloud, pixel: tuple[int, int] | None) -> tuple[float, flo
     """x and y of the point of a pixel, or of the nearest pixel that has one."""
     if pixel is None or cloud.shape is None:
         raise UsageError("give a cell or a pixel")
-    height, width = cloud.shape
-    if not (0 <= pixel[0] < width and 0 <= pixel[1] < height):
-        raise UsageError(f"the pixel {pixel[0]},{pixel[1]} is outside the image of {width}x{height}")
+    (height, width), (x, y) = cloud.shape, pixel
+    if not (0 <= x < width and 0 <= y < height):
+        raise UsageError(f"the pixel {x},{y} is outside the image of {width}x{height}")
     rows, cols = np.divmod(cloud.pixel, width)
-    nearest = int(np.argmin((rows - pixel[1]) ** 2 + (cols - pixel[0]) ** 2))
-    if math.hypot(rows[nearest] - pixel[1], cols[nearest] - pixel[0]) > 10:
+    nearest = int(np.argmin((rows - y) ** 2 + (cols - x) ** 2))
+    if math.hypot(rows[nearest] - y, cols[nearest] - x) > REACH_PX:
         raise UsageError(
-            f"no point of the map is within 10 px of the pixel {pixel[0]},{pixel[1]}: it is unknown or too far"
+            f"no point of the map is within {REACH_PX:g} px of the pixel {x},{y}: it is unknown or too far"
         )
     return float(cloud.points[nearest, 0]), float(cloud.points[nearest, 1])
 

@@ -26,6 +26,13 @@ def say(text: str) -> None:
             raise
 
 
+def duration(seconds: float) -> str:
+    """A time about as exact as an estimate is."""
+    if seconds >= 7200:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"
+
+
 def exit_code(summary: dict[str, Any]) -> int:
     """The exit code of a run."""
     if summary["interrupted"]:

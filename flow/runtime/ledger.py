@@ -7,7 +7,6 @@ the end and all outputs were written.
 from __future__ import annotations
 
 import logging
-import threading
 from collections import Counter
 from pathlib import Path
 from traceback import extract_tb
@@ -35,20 +34,17 @@ class Ledger:
     """The losses of one run. Threads may share it."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._entries: list[Loss] = []
 
     def add(self, entry: Loss) -> Loss:
         """Enter a loss, and return it."""
-        with self._lock:
-            self._entries.append(entry)
+        self._entries.append(entry)
         return entry
 
     @property
     def entries(self) -> tuple[Loss, ...]:
         """All entries, by stamp, stage and stream, so that equal runs have equal ledgers."""
-        with self._lock:
-            return tuple(sorted(self._entries, key=lambda entry: (entry.stamp, entry.stage, entry.stream)))
+        return tuple(sorted(self._entries, key=lambda entry: (entry.stamp, entry.stage, entry.stream)))
 
     def counts(self) -> dict[str, int]:
         """Number of entries by reason."""

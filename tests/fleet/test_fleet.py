@@ -67,7 +67,7 @@ def rows_of(folder: Path) -> dict[str, dict]:
 def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
     (job,) = jobs_of([str(logs / "a.mcap")], tmp_path / "out")
     pipeline = Pipeline.of("fast", ("disparities=48",))
-    task = Task(job.name, job.log, job.digest, job.result(tmp_path / "out"), pipeline, recording=False, workers=2)
+    task = Task(job, tmp_path / "out", pipeline, recording=False, workers=2)
     row = run_task(task)
     assert (row["state"], row["verdict"], row["frames"], row["result"]) == ("done", "COMPLETE", 1, "a-nav.mcap")
     assert roverflow("run", logs / "a.mcap", *PIPELINE, "--no-rrd", "-o", tmp_path / "plain.mcap") == 0
@@ -81,9 +81,9 @@ def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
     assert reason_to_run(job, row, *same) == "its recording is missing"
     assert run_task(replace(task, recording=True))["result"] == "a-nav.mcap"
     assert reason_to_run(job, row, *same) == ""
-    broken = run_task(replace(task, log=logs / "junk.mcap", result=tmp_path / "out" / "junk-nav.mcap"))
+    broken = run_task(replace(task, job=replace(job, name="junk", log=logs / "junk.mcap")))
     assert (broken["state"], "is not an MCAP log" in broken["why"]) == ("unusable", True)
-    absent = run_task(replace(task, log=logs / "nix.mcap", result=tmp_path / "out" / "nix-nav.mcap"))
+    absent = run_task(replace(task, job=replace(job, name="nix", log=logs / "nix.mcap")))
     assert (absent["state"], "paths must mean the same on all machines" in absent["why"]) == ("failed", True)
 
 
@@ -120,9 +120,9 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, s
 
 def test_a_progress_file_that_is_just_being_written_is_no_stall(logs, tmp_path):
     (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
-    task = Task(job.name, job.log, job.digest, job.result(tmp_path), Pipeline.of("fast", ()), False, workers=1)
+    task = Task(job, tmp_path, Pipeline.of("fast", ()), False, workers=1)
     progress = Progress({"a": job.size})
-    fleet = Fleet(tmp_path, Catalogue(tmp_path, create=True), {"a": (job, task)}, progress, left={"a"})
+    fleet = Fleet(Catalogue(tmp_path, create=True), {"a": task}, progress, left={"a"})
     fleet.catalogue.put("a", {"state": "waiting"})
     for content, state in (("", "waiting"), ("1", "running"), ("", "running")):
         task.progress.write_text(content)
@@ -166,7 +166,7 @@ def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, said):
 
 def test_a_worker_that_stays_forgets_the_stages_of_an_earlier_fleet(logs, tmp_path):
     (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
-    task = Task(job.name, job.log, job.digest, job.result(tmp_path), Pipeline.of("fast", ()), False, workers=1)
+    task = Task(job, tmp_path, Pipeline.of("fast", ()), False, workers=1)
     text = TRAPPED.replace("trap.Trap", "travelled_trap.Trap").encode()
     for code, refused in ((TRAP, ""), ("", "cannot load the pipeline"), (TRAP, "")):
         files = {"own.yaml": text, "travelled_trap.py": code.encode()}

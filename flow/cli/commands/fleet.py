@@ -64,9 +64,10 @@ def run(options: argparse.Namespace) -> int:
 
 def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipeline, catalogue: Catalogue) -> None:
     """Say which jobs have to run, and why, and run them."""
-    from flow.cli.fleet.engine import Fleet, cluster, tasks_of
+    from flow.cli.fleet.engine import Fleet, cluster
     from flow.cli.fleet.jobs import reason_to_run
     from flow.cli.fleet.progress import Progress
+    from flow.cli.fleet.task import Task
     from flow.cli.replay import product_version
     from flow.runtime.bottleneck import usable_cores
 
@@ -81,7 +82,7 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
     say(f"{counted(len(jobs), 'log')}: {len(jobs) - len(due)} done before, {len(due)} to run{more}")
     if not due:
         return
-    tasks = tasks_of(due, folder, pipeline, options.rrd, options.workers_per_log)
+    tasks = {job.name: Task(job, folder, pipeline, options.rrd, options.workers_per_log) for job in due}
     processes = options.processes or max(1, usable_cores() // options.workers_per_log)
     with (
         cluster(
@@ -89,7 +90,7 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
         ) as client,
         Progress({job.name: job.size for job in due}) as progress,
     ):
-        Fleet(folder, catalogue, tasks, progress, stall_seconds=options.stall).run(client)
+        Fleet(catalogue, tasks, progress, stall_seconds=options.stall).run(client)
 
 
 def _verdict(rows: list[dict[str, object]], folder: Path) -> int:

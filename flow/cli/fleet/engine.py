@@ -5,15 +5,13 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
 from flow.cli.fleet.catalogue import WAITING, Catalogue
-from flow.cli.fleet.jobs import Job
 from flow.cli.fleet.progress import Progress, frames_so_far
 from flow.cli.fleet.task import Task, about_worker, run_task, unfit
 from flow.errors import INCOMPLETE, RoverflowError, UsageError
@@ -33,9 +31,8 @@ class ClusterLostError(RoverflowError):
 class Fleet:
     """What a fleet runs. stall_seconds: without a new frame, after which a log counts as hung."""
 
-    folder: Path
     catalogue: Catalogue
-    tasks: dict[str, tuple[Job, Task]]
+    tasks: dict[str, Task]
     progress: Progress
     stall_seconds: float = 600.0
     left: set[str] = field(default_factory=set)
@@ -47,7 +44,7 @@ class Fleet:
         from distributed import as_completed
 
         self._check(client)
-        self.catalogue.put_all({name: _waiting(job, task) for name, (job, task) in self.tasks.items()})
+        self.catalogue.put_all({name: _waiting(task) for name, task in self.tasks.items()})
         self.left = set(self.tasks)
         futures = {self._submit(client, name, place): name for place, name in enumerate(self.tasks)}
         ended, looked = as_completed(futures), 0.0
@@ -69,16 +66,16 @@ class Fleet:
 
     def _submit(self, client: Any, name: str, place: int) -> Any:
         """The future of a task; the smallest place runs first."""
-        task = self.tasks[name][1]
+        task = self.tasks[name]
         with suppress(OSError):  # of a worker that died
             task.progress.unlink()
         self._seen.pop(name, None)
-        key = f"roverflow-{task.log_digest}-{time.time_ns()}"
+        key = f"roverflow-{task.job.digest}-{time.time_ns()}"
         return client.submit(run_task, task, key=key, priority=-place, pure=False)
 
     def _check(self, client: Any) -> None:
         """Refuse workers of another version, pipeline or machine, and those that do not see the logs or the stages."""
-        _, task = next(iter(self.tasks.values()))
+        task = next(iter(self.tasks.values()))
         with suppress(TimeoutError):
             client.wait_for_workers(1, timeout=WORKER_SECONDS)
         found = client.run(about_worker, task)
@@ -102,7 +99,7 @@ class Fleet:
         """Write the row of a task that has ended; returns its future and name if it is tried once more."""
         if name not in self.left:
             return None
-        job, task = self.tasks[name]
+        task = self.tasks[name]
         if future.status == "finished":
             row = dict(future.result())
             if any(row[name] != value for name, value in task.identity().items()):  # a worker that came later
@@ -121,7 +118,7 @@ class Fleet:
             )
             row = {"state": "killed" if dead else "failed", "why": why}
         if row.get("result"):
-            row["result"] = job.result(self.folder).relative_to(self.folder).as_posix()
+            row["result"] = task.result.relative_to(task.folder).as_posix()
         self._note(name, row)
         return None
 
@@ -136,7 +133,7 @@ class Fleet:
         now, running = time.monotonic(), dict[str, int]()
         begun = set[str]()
         for future, name in [item for item in futures.items() if item[1] in self.left]:
-            frames = frames_so_far(self.tasks[name][1].progress)
+            frames = frames_so_far(self.tasks[name].progress)
             if frames is None:
                 continue
             running[name] = frames
@@ -154,7 +151,7 @@ class Fleet:
         """Restart the worker of a task without progress; one that waits for a worker again is left."""
         holders = [worker for worker, keys in client.processing().items() if future.key in map(str, keys)]
         with suppress(OSError):
-            self.tasks[name][1].progress.unlink()
+            self.tasks[name].progress.unlink()
         if not holders:
             self._seen.pop(name, None)
             return
@@ -165,10 +162,10 @@ class Fleet:
         self._note(name, {"state": "hung", "why": why})
 
 
-def _waiting(job: Job, task: Task) -> dict[str, Any]:
+def _waiting(task: Task) -> dict[str, Any]:
     """The row of a log that waits."""
     row = WAITING | task.identity()
-    return row | {"log": str(job.log), "bytes": job.size, "pipeline": task.pipeline.name}
+    return row | {"log": str(task.job.log), "bytes": task.job.size, "pipeline": task.pipeline.name}
 
 
 @contextmanager
@@ -222,13 +219,3 @@ def cluster(address: str | None, processes: int, cores: int, memory: str, dashbo
     with local, Client(local) as client:
         client.register_plugin(CoreBinding(processes, cores))
         yield client
-
-
-def tasks_of(
-    jobs: Sequence[Job], folder: Path, pipeline: Any, recording: bool, workers: int
-) -> dict[str, tuple[Job, Task]]:
-    """Name -> job and task."""
-    return {
-        job.name: (job, Task(job.name, job.log, job.digest, job.result(folder), pipeline, recording, workers))
-        for job in jobs
-    }

@@ -25,10 +25,6 @@ class Job:
     size: int
     digest: str
 
-    def result(self, folder: Path) -> Path:
-        """The result log."""
-        return folder / f"{self.name}{RESULT_ENDING}.mcap"
-
 
 def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, Any]] = ()) -> list[Job]:
     """The jobs of logs, folders of logs, patterns, and text files that list these; the largest first.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.fleet.catalogue import Catalogue
-from flow.cli.report import say
+from flow.cli.report import duration, say
 from flow.contracts import counted
 from flow.errors import COMPLETE, INCOMPLETE
 from recordings.containers.finding import RESULT_ENDING
@@ -116,14 +116,6 @@ def line_of(row: Mapping[str, Any]) -> str:
     why = f", {row['why']}" if row.get("why") else ""
     frames = f"{row['complete']} of {row['frames']} frames{why}"
     return f"{row['verdict']}, {frames}; {row['seconds']:.0f} s on {row['node']}"
-
-
-def duration(seconds: float) -> str:
-    """A time that is left, in its natural unit."""
-    for unit, size in (("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.0f} s"
 
 
 def _rows(catalogue: Catalogue) -> dict[str, dict[str, Any]]:

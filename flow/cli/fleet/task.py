@@ -15,10 +15,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from flow.cli.fleet.jobs import Job
 from flow.cli.replay import product_version, replay
 from flow.config.loader import SHIPPED, load, shipped
 from flow.contracts import Verdict
 from flow.errors import RoverflowError, UsageError
+from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
 
 MAX_FILE_BYTES = 4 << 20  # of a file beside a pipeline that travels with it
@@ -81,15 +83,18 @@ def _forget_others(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Task:
-    """One log to run. result: the result log; recording: also write a rerun recording; workers: threads."""
+    """A job to run. folder: of the fleet; recording: also write a rerun recording; workers: threads."""
 
-    name: str
-    log: Path
-    log_digest: str
-    result: Path
+    job: Job
+    folder: Path
     pipeline: Pipeline
     recording: bool
     workers: int
+
+    @property
+    def result(self) -> Path:
+        """The result log."""
+        return self.folder / f"{self.job.name}{RESULT_ENDING}.mcap"
 
     @property
     def note(self) -> Path:
@@ -103,7 +108,7 @@ class Task:
 
     def identity(self) -> dict[str, str]:
         """What the result depends on."""
-        return {"log_digest": self.log_digest, "pipeline_digest": self.pipeline.digest, "version": product_version()}
+        return {"log_digest": self.job.digest, "pipeline_digest": self.pipeline.digest, "version": product_version()}
 
 
 def run_task(task: Task) -> dict[str, Any]:
@@ -114,9 +119,8 @@ def run_task(task: Task) -> dict[str, Any]:
     if (found := _finished(task)) is not None:
         return found
     node = {"node": f"{platform.node()}:{os.getpid()}"}
-    if not task.log.exists():  # no fault of the log
-        why = f"{platform.node()} has no {task.log}; paths must mean the same on all machines"
-        return task.identity() | node | {"state": "failed", "why": why}
+    if why := _absent(task):  # no fault of the log
+        return task.identity() | node | {"state": "failed", "why": f"{platform.node()} {why}"}
     task.result.parent.mkdir(parents=True, exist_ok=True)
     for stale in task.result.parent.glob(f"{task.result.name}.*.partial"):  # of a worker that died
         with suppress(OSError):
@@ -150,10 +154,8 @@ def _run(task: Task) -> dict[str, Any]:
 
     count(True)
     recording = task.result.with_suffix(".rrd") if task.recording else None
-    changes = task.pipeline.changes
-    return replay(
-        task.log, task.pipeline.local(), task.result, recording, overrides=changes, workers=task.workers, on_frame=count
-    )
+    log, pipeline, changes = task.job.log, task.pipeline.local(), task.pipeline.changes
+    return replay(log, pipeline, task.result, recording, overrides=changes, workers=task.workers, on_frame=count)
 
 
 def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -192,10 +194,14 @@ def about_worker(task: Task) -> dict[str, str]:
     return {"version": product_version(), "pipeline": task.pipeline.digest} | libraries | target
 
 
+def _absent(task: Task) -> str:
+    return "" if task.job.log.exists() else f"has no {task.job.log}; paths must mean the same on all machines"
+
+
 def unfit(task: Task) -> str:
     """Why this machine cannot run a task, or nothing."""
-    if not task.log.exists():
-        return f"has no {task.log}; paths must mean the same on all machines"
+    if why := _absent(task):
+        return why
     try:
         load(task.pipeline.local(), task.pipeline.changes)
     except RoverflowError as error:
