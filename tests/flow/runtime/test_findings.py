@@ -1,21 +1,16 @@
 """Findings of the stages reach the user and the sinks, warnings last."""
 
-from pathlib import Path
-
 import pytest
 
 from flow.cli.report import headline, report
 from flow.contracts import Finding, Severity
 from flow.runtime.findings import checked, explained
-from flow.runtime.run import run
-from tests.flow.toys import Log, graph, replayed, traverse
+from tests.flow.toys import graph, replayed, traverse
 
 
 def printed(folder, frames, capsys):
     """The lines that a run of so many frames prints."""
-    pipeline = graph(folder)
-    ((use, _),) = pipeline.sinks
-    summary = run(pipeline, Log(traverse(frames)), {use: Path("unused")})
+    _, summary = replayed(graph(folder), traverse(frames))
     report(summary | {"outputs": [], "bottleneck": {}})
     return capsys.readouterr().out.splitlines()
 

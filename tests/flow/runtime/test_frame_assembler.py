@@ -10,12 +10,16 @@ from flow.runtime.frame_assembler import FrameAssembler
 from flow.runtime.ledger import Ledger
 from tests.flow.toys import MS, PIPELINE, Number, Text, graph, replayed, traverse
 
+AHEAD = 4_000 * MS, 12_000 * MS, 3_600_000 * MS
+DAMAGED = (4,), (4, 8), (4, 7, 13), (0,), (0, 2, 9)
+IN_A_ROW = {4: 3_600_000 * MS, 5: 7_200_000 * MS}
 
-@pytest.mark.parametrize("ahead", [4_000 * MS, 12_000 * MS, 3_600_000 * MS])
-@pytest.mark.parametrize("damaged", [{4}, {4, 8}, {4, 7, 13}, {0}, {0, 2, 9}])
-def test_every_damaged_stamp_costs_one_message(tmp_path, ahead, damaged):
+
+@pytest.mark.parametrize("damaged", [*(dict.fromkeys(at, ahead) for at in DAMAGED for ahead in AHEAD), IN_A_ROW])
+def test_every_damaged_stamp_costs_one_message(tmp_path, damaged):
+    """Damaged: by how much, ns, the stamps of some left messages are ahead."""
     events = [
-        (at, stream, Number(at + ahead, item.value) if stream == "left" and at // (100 * MS) in damaged else item)
+        (at, stream, Number(at + damaged.get(at // (100 * MS), 0), item.value) if stream == "left" else item)
         for at, stream, item in traverse(20)
     ]
     _, summary = replayed(graph(tmp_path), events)
@@ -52,6 +56,10 @@ def test_a_clock_years_from_that_of_the_log_costs_nothing(tmp_path, frames):
         assert summary["verdict"] == "COMPLETE"
 
 
+LAST_WORDS = PIPELINE.replace("sinks:", "  last_words: {use: flow.align.latest, stream: words, at: both}\nsinks:")
+ALONE = (0, "words", Text(3_600_000 * MS, "alone"))
+
+
 @given(stalls=st.lists(st.tuples(st.integers(0, 9_000), st.integers(1, 9_000)), max_size=4))
 def test_a_log_that_was_written_in_bursts_loses_nothing(tmp_path_factory, stalls):
     """A recorder that stalls for up to nine seconds then logs all waiting messages at once."""
@@ -75,27 +83,13 @@ def test_a_suspect_stamp_does_not_hold_up_the_log(tmp_path):
             read[stream] += 1
             yield at, stream, item
 
-    alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
-    text = PIPELINE.replace("sinks:", "  last_words: {use: flow.align.latest, stream: words, at: both}\nsinks:")
-    assembler = FrameAssembler(graph(tmp_path, text=text), Ledger())
-    next(assembler.frames(counted(alone + traverse(1000)[1:])))
+    assembler = FrameAssembler(graph(tmp_path, text=LAST_WORDS), Ledger())
+    next(assembler.frames(counted([ALONE, *traverse(1000)[1:]])))
     assert read["left"] < 110
 
 
 def test_reading_ahead_of_a_suspect_stamp_is_bounded(tmp_path):
-    alone = [(0, "words", Text(3_600_000 * MS, "alone"))]
     often = [(at, "level", Number(at, at / 1e9)) for at in range(MS, 5000 * MS, MS)]
-    text = PIPELINE.replace("sinks:", "  last_words: {use: flow.align.latest, stream: words, at: both}\nsinks:")
-    read = iter(alone + traverse(1)[:3] + often)
-    next(FrameAssembler(graph(tmp_path, text=text), Ledger()).frames(read))
+    read = iter([ALONE, *traverse(1)[:3], *often])
+    next(FrameAssembler(graph(tmp_path, text=LAST_WORDS), Ledger()).frames(read))
     assert len(often) - len(list(read)) < 130
-
-
-def test_two_damaged_stamps_in_a_row_cost_two_messages(tmp_path):
-    hours = {4: 3_600_000 * MS, 5: 7_200_000 * MS}
-    events = [
-        (at, stream, Number(at + hours.get(at // (100 * MS), 0), item.value) if stream == "left" else item)
-        for at, stream, item in traverse(20)
-    ]
-    _, summary = replayed(graph(tmp_path), events)
-    assert (summary["frames_out"], summary["drops"]) == (18, {"out of order": 2, "unmatched": 2})

@@ -5,13 +5,12 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 
 from flow.errors import SinkError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
-from flow.runtime.run import asked, run, with_spare_threads
+from flow.runtime.run import asked, with_spare_threads
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, traverse
 
 
@@ -94,9 +93,7 @@ def test_a_log_that_fails_midway_keeps_the_frames_read_before(tmp_path):
             yield from super().events(streams)
             raise OSError("input/output error")
 
-    pipeline = graph(tmp_path)
-    ((use, sink),) = pipeline.sinks
-    summary = run(pipeline, Broken(traverse(5)), {use: Path("unused")})
+    sink, summary = replayed_log(graph(tmp_path), Broken(traverse(5)))
     assert len(sink.values("raised")) == 5
     assert summary["drops"] == {"unreadable": 1}
 
@@ -129,8 +126,7 @@ def test_losses_before_an_interrupt_reach_the_sinks(tmp_path):
             yield 1100 * MS, "left", OSError("chunk 8 is damaged")
 
     damaged = Damaged([*traverse(3), (400 * MS, "left", OSError("chunk 6 is damaged"))])
-    ((use, sink),) = pipeline.sinks
-    summary = run(pipeline, damaged, {use: Path("unused")}, stop=stop)
+    sink, summary = replayed_log(pipeline, damaged, stop=stop)
     assert [entry.detail for entry in sink.summary["entries"]] == ["chunk 6 is damaged"]
     assert summary["drops"] == {"unreadable": 1}
 
@@ -268,9 +264,9 @@ def test_a_run_that_raises_is_never_marked_complete(tmp_path):
             raise SystemExit
 
     pipeline = graph(tmp_path)
-    ((use, sink),) = pipeline.sinks
+    ((_, sink),) = pipeline.sinks
     with pytest.raises(SystemExit):
-        run(pipeline, Torn(traverse(3)), {use: Path("unused")})
+        replayed_log(pipeline, Torn(traverse(3)))
     assert sink.summary["verdict"] == "INCOMPLETE"
 
 
@@ -290,19 +286,20 @@ def test_patience_runs_on_the_clock_of_the_whole_log(tmp_path):
     assert entry["detail"] == "no partner within 3 s of log time (both.patience)"
 
 
+def without_level():
+    return Log(traverse(3), missing={"level": "no level"})
+
+
 def test_a_log_without_a_needed_stream_is_refused_with_its_reason(tmp_path):
-    pipeline = graph(tmp_path)
-    with pytest.raises(UsageError, match="no level in it"):
-        run(pipeline, Log([], missing={"level": "no level in it"}), {})
+    with pytest.raises(UsageError, match="no level"):
+        replayed_log(graph(tmp_path), without_level())
 
 
 def test_an_optional_stage_is_left_out_if_the_log_lacks_its_input(tmp_path):
     text = PIPELINE
     for line in ("at: both", "b: height"):
         text = text.replace(line, f"{line}, optional: true")
-    pipeline = graph(tmp_path, text=text)
-    ((use, sink),) = pipeline.sinks
-    summary = run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
+    sink, summary = replayed_log(graph(tmp_path, text=text), without_level())
     assert summary["verdict"] == "COMPLETE"
     assert "raised" not in sink.streams
     assert {"severity": "note", "sentence": "left out: no level"} in summary["findings"].values()
@@ -312,8 +309,7 @@ def test_an_optional_stage_is_left_out_if_the_log_lacks_its_input(tmp_path):
 def test_an_optional_port_stays_open_where_the_log_lacks_its_stream(tmp_path):
     text = PIPELINE.replace("at: both}", "at: both, optional: true}")
     pipeline = graph(tmp_path, text=text.replace("toys.Add, a: sum, b: h", "toys.Either, a: sum, b: h"))
-    ((use, sink),) = pipeline.sinks
-    run(pipeline, Log(traverse(3), missing={"level": "no level"}), {use: Path("unused")})
+    sink, _ = replayed_log(pipeline, without_level())
     assert sink.values("raised") == sink.values("sum")
 
 
@@ -322,7 +318,7 @@ def test_a_stage_without_a_needed_input_is_refused_or_left_out(tmp_path, optiona
     text = PIPELINE.replace("at: both}", "at: both, optional: true}")
     either = f"toys.Either, both: true, optional: {str(optional).lower()}, a: sum, b: h"
     text = text.replace("toys.Add, a: sum, b: h", either)
-    pipeline, log = graph(tmp_path, text=text), Log(traverse(3), missing={"level": "no level"})
+    pipeline, log = graph(tmp_path, text=text), without_level()
     why = "stream 'raised': Either.both needs a `b`, and no level"
     if optional:
         assert replayed_log(pipeline, log)[1]["findings"]["raised"]["sentence"] == f"left out: {why}"
@@ -352,7 +348,7 @@ def test_failing_notes_of_a_log_lose_no_output(tmp_path):
 def test_a_pipeline_whose_streams_are_all_missing_is_refused(tmp_path):
     text = re.sub(r"^(  \w+: +{.*)}$", r"\1, optional: true}", PIPELINE, flags=re.MULTILINE)
     with pytest.raises(UsageError, match="no right camera"):
-        run(graph(tmp_path, text=text), Log([], missing={"right": "no right camera"}), {})
+        replayed_log(graph(tmp_path, text=text), Log([], missing={"right": "no right camera"}))
 
 
 def test_an_output_that_fails_at_its_end_makes_the_run_incomplete(tmp_path, monkeypatch):
