@@ -24,8 +24,8 @@ from recordings.simulator import Simulation
 from recordings.sinks import colormaps
 from stages.data import Array, Cell, CellReason, ElevationMap
 from tests.bench.refining import DISPARITIES, stage, stereo_part
+from tests.bench.stereo_scores import devon
 from tests.bench.terrain import frames, measured_tilt, through
-from tests.study import devon
 
 VIEWS = ((11, 0.05, 15), (12, 0.15, 0), (13, 0.15, 15))  # seed, rocks k, frame of 30: the first or the middle one
 SHOWN = (

@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 
 from recordings.simulator import Simulation
-from stages import Disparity, Match, PixelOrigin, Rectify, Refine, StereoCamera, StereoFrame
+from recordings.sinks import colormaps
+from stages import Disparity, Match, PixelOrigin, Rectify, Refine, StereoFrame
 from stages.data import Array
 from stages.refinement.refine import TRUST
 from tests.bench.refining import COLUMNS, RELEASED, row, scenes, stage, stereo_part
-from tests.bench.stereo_scores import errors, rows_filled
+from tests.bench.stereo_scores import devon, errors, rows_filled
 
 PLAIN: dict[str, Any] = {
     "median_size": 0, "plane_weight": 0, "plane_fill": False, "surface_size": 0, "bilateral_radius": 0,
@@ -31,8 +32,6 @@ LAST: dict[str, Any] = {"bilateral_radius": 0, "edge_radius": 0, "support": Fals
 ABUNDANCES = {1: 0.05, 2: 0.15, 3: 0.10}  # of rocks, by seed
 PLANE, STEP, CONTRASTS = 25, 8, (0, 2, 4, 8)  # px, side and spacing of planes; gray levels from which classes begin
 EDGE_STEP, EDGE_REACH = 2.0, 3  # px of disparity that make an edge of depth, px from it that count as near
-SOURCE_COLOURS = np.full((len(PixelOrigin), 3), 40, np.uint8)
-SOURCE_COLOURS[1:4] = [70, 160, 70], [70, 110, 210], [230, 150, 50]
 
 
 class Case(NamedTuple):
@@ -187,13 +186,15 @@ VARIANTS: dict[str, Chain] = {
 }
 
 
+def edges_of(pixels: Array) -> Array:
+    """Where the disparity has a step, (H, W) uint8; unknown pixels count as infinitely far."""
+    window, known = np.ones((3, 3)), np.nan_to_num(pixels)
+    return np.uint8(cv2.dilate(known, window) - cv2.erode(known, window) > EDGE_STEP)
+
+
 def near_edges(truth: Array) -> Array:
     """Where a step of the true disparity is near, (H, W) bool."""
-    window = np.ones((2 * EDGE_REACH + 1,) * 2, np.uint8)
-    known = np.nan_to_num(truth)
-    step: Array = cv2.dilate(known, np.ones((3, 3))) - cv2.erode(known, np.ones((3, 3))) > EDGE_STEP
-    near: Array = cv2.dilate(step.astype(np.uint8), window) > 0
-    return near
+    return np.asarray(cv2.dilate(edges_of(truth), np.ones((2 * EDGE_REACH + 1,) * 2, np.uint8)) > 0)
 
 
 def measure(cases: list[Case]) -> dict[str, Array]:
@@ -288,30 +289,15 @@ def pictures(folder: Path, name: str, frame: StereoFrame, disparity: Disparity) 
     folder.mkdir(parents=True, exist_ok=True)
     image = frame.left if frame.left.ndim == 3 else np.dstack([frame.left] * 3)
     known = np.isfinite(disparity.pixels)
-    top = np.percentile(disparity.pixels[known], 99.5) if known.any() else 1.0
-    scaled = np.where(known, np.clip(disparity.pixels / top, 0, 1) * 255, 0).astype(np.uint8)
-    coloured = cv2.cvtColor(cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
-    coloured[~known] = 0
+    coloured = colormaps.disparity_colors(disparity.pixels)
+    origin = colormaps.legend_colors(np.where(known, disparity.source, PixelOrigin.UNKNOWN), colormaps.SOURCE_LEGEND)
     trust = np.dstack([(disparity.confidence * 255).astype(np.uint8)] * 3)
     overlay = image.copy()
-    step = cv2.dilate(scaled, np.ones((3, 3))).astype(int) - cv2.erode(scaled, np.ones((3, 3)))
-    overlay[known & (step > 255 * EDGE_STEP / top)] = (255, 40, 40)
-    rows = [np.hstack([image, coloured]), np.hstack([SOURCE_COLOURS[disparity.source], trust])]
+    overlay[known & (edges_of(disparity.pixels) > 0)] = (255, 40, 40)
+    rows = [np.hstack([image, coloured]), np.hstack([origin, trust])]
     for suffix, picture in (("", np.vstack(rows)), ("-edges", overlay)):
         file = folder / f"{name}{suffix}.jpg"
         cv2.imwrite(str(file), cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])
-
-
-def devon(folder: Path) -> Iterator[tuple[str, StereoFrame]]:
-    """The Devon Island pairs of a folder of real data, with the camera of its FORMAT.md."""
-    camera = StereoCamera(
-        fx=968.999694824, fy=968.999694824, cx=635.139038086, cy=463.537109375, baseline=0.239977,
-        width=1280, height=960,
-    )  # fmt: skip
-    for left in sorted((folder / "devon").glob("*left*.png")):
-        right = left.with_name(left.name.replace("left", "right"))
-        pair = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in (left, right)]
-        yield left.stem.replace("left", "").strip("_-"), StereoFrame(1, *pair, camera)
 
 
 def print_scatter(name: str, frame: StereoFrame, found: dict[str, Disparity]) -> None:
@@ -365,13 +351,8 @@ def main(folder: Path) -> None:
     for case in cases:
         streams = stereo_part("accurate", case.frame, case.disparities, entry="rectified")
         pictures(folder, case.name.replace(" ", "-"), case.frame, streams["disparity"])
-    legend = ", ".join(_legend())
+    legend = "unknown dark, measured green, plane blue, filled orange"
     print(f"\npictures in {folder}: image, disparity; {legend}; confidence; edges of disparity on the image")
-
-
-def _legend() -> Iterator[str]:
-    for code, colour in zip(PixelOrigin, ("black", "green", "blue", "orange"), strict=False):
-        yield f"{code.name.lower()} {colour}"
 
 
 if __name__ == "__main__":

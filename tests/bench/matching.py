@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,6 +25,7 @@ from flow.runtime.malloc import keep_freed_memory
 from recordings.simulator import Simulation
 from stages import Disparity, Match, MatchOpenCV, Rectify, Refine, StereoCamera, StereoFrame
 from stages.data import Array
+from tests.bench.stereo_scores import devon, load_scene, rows_filled
 
 WIDTH, HEIGHT = 1280, 960
 ROUNDS = 9
@@ -147,8 +149,6 @@ def start_up(cache: Path) -> None:
 
 def accuracy(folder: Path) -> None:
     """Print the errors of Match and of OpenCV's best mode on scenes with truth, before refinement."""
-    from tests.bench.stereo_scores import load_scene, rows_filled
-
     rows: dict[str, list[list[float]]] = {}
     for scene in sorted(folder.iterdir()):
         frame, truth, mask, levels = load_scene(scene)
@@ -195,31 +195,23 @@ def fractions() -> None:
         print(f"{name:34} {' '.join(f'{error:+6.2f}' for error in errors)}")
 
 
-def rows(folder: Path) -> None:
+def rows(data: Path) -> None:
     """Print how the row correction changes what is matched on real rover images, right of the columns that only the
     left camera sees and below the sky."""
-    camera = StereoCamera(968.999, 968.999, 635.139, 463.537, 0.239977, WIDTH, HEIGHT)
-    print(
-        f"\n{'Devon Island':34} {'density':>8} {'mean confidence':>16} {'density where both views agree exactly':>40}"
-    )
-    for path in sorted(folder.glob("*-left.png")):
-        left, right = (cv2.imread(str(path).replace("left", side)) for side in ("left", "right"))
-        frame = StereoFrame(0, left[..., ::-1], right[..., ::-1], camera)
+    title = f"{'density':>8} {'mean confidence':>16} {'density where both views agree exactly':>40}"
+    print(f"\n{'Devon Island':34} {title}")
+    for pair, frame in devon(data):
         for name, stage in (("as calibrated", Rectify(row_offset=0.0)), ("rows corrected", Rectify())):
             rectified = stage(frame)
             found, strict = Match()(rectified), Match(lr_tolerance=0)(rectified)
             known, agreed = (np.isfinite(each.pixels[300:, 192:]) for each in (found, strict))
             confidence = found.confidence[300:, 192:][known].mean()
-            print(
-                f"{path.stem.partition('-')[0] + ', ' + name:34} {100 * known.mean():8.1f} {confidence:16.3f}", end=""
-            )
-            print(f" {100 * agreed.mean():40.1f}")
+            figures = f"{100 * known.mean():8.1f} {confidence:16.3f} {100 * agreed.mean():40.1f}"
+            print(f"{f'{pair}, {name}':34} {figures}")
 
 
 def main() -> None:
     """Print all tables."""
-    import tempfile
-
     speed()
     with tempfile.TemporaryDirectory() as cache:
         start_up(Path(cache))
@@ -227,7 +219,7 @@ def main() -> None:
     data = os.environ.get("ROVERFLOW_DATA")
     if data:
         accuracy(Path(data) / "middlebury-q")
-        rows(Path(data) / "devon")
+        rows(Path(data))
 
 
 if __name__ == "__main__":

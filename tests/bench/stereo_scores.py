@@ -6,14 +6,16 @@ is over known pixels.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from flow.config.loader import load
 from recordings.importers.middlebury import read_scene
 from recordings.scoring.stereo_metrics import StereoErrors
-from stages.data import Array, StereoFrame
+from stages.data import Array, StereoCamera, StereoFrame
 from stages.matching.match_opencv import MatchOpenCV
 from stages.refinement.paper import RefinePaper
 
@@ -48,3 +50,15 @@ def rows_filled(disparity: Array) -> Array:
     padded = np.pad(disparity, ((0, 0), (1, 1)), constant_values=np.nan)
     ends = np.take_along_axis(padded, left + 1, axis=1), np.take_along_axis(padded, right + 1, axis=1)
     return np.where(known, disparity, np.fmin(*ends)).astype(np.float32)
+
+
+def devon(folder: Path) -> Iterator[tuple[str, StereoFrame]]:
+    """The Devon Island pairs of a folder of real data, with the camera of its FORMAT.md."""
+    camera = StereoCamera(
+        fx=968.999694824, fy=968.999694824, cx=635.139038086, cy=463.537109375, baseline=0.239977,
+        width=1280, height=960,
+    )  # fmt: skip
+    for left in sorted((folder / "devon").glob("*left*.png")):
+        right = left.with_name(left.name.replace("left", "right"))
+        pair = [cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB) for file in (left, right)]
+        yield left.stem.replace("left", "").strip("_-"), StereoFrame(1, *pair, camera)
