@@ -4,7 +4,7 @@ import fcntl
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,8 @@ settings.load_profile("quick")
 FRAMES = 3
 TRAVERSE = {"frames": FRAMES, "width": 320, "height": 240, "relief_cells": 512}  # of Simulation
 SMALL = ("--set", "disparities=64")
+Row = tuple[str, str, tuple[str, str, bytes] | None, int, bytes | None]  # topic, encoding, schema, log time, data
+Extra = Callable[[Writer, dict[str, int]], object]  # writes more to a log; takes topic -> channel
 
 
 @pytest.fixture(scope="session")
@@ -120,38 +122,72 @@ def refused(said: Callable[..., Any]) -> Callable[..., str]:
     return command
 
 
+def mcap_rows(log: Path) -> list[Row]:
+    """The messages of a log in the order of log time."""
+    with log.open("rb") as file:
+        return [
+            (channel.topic, channel.message_encoding, (schema.name, schema.encoding, schema.data), at.log_time, at.data)
+            for schema, channel, at in make_reader(file).iter_messages()
+            if schema
+        ]
+
+
+def write_mcap(
+    out: Path,
+    rows: Iterable[Row],
+    profile: str = "ros2",
+    extra: Extra = lambda writer, channels: None,
+    **options: Any,
+) -> Path:
+    """Write a log; a row without data gives its topic a channel alone.
+
+    extra: is called at the end; options: of mcap.writer.Writer.
+    """
+    with out.open("wb") as file:
+        writer, channels = Writer(file, **options), dict[Any, int]()
+        writer.start(profile=profile, library="test")
+        for topic, encoding, schema, log_time, data in rows:
+            key = topic, encoding, schema
+            if key not in channels:
+                known = writer.register_schema(*schema) if schema else 0
+                channels[key] = writer.register_channel(topic, encoding, known)
+            if data is not None:
+                writer.add_message(channels[key], log_time, data, log_time)
+        extra(writer, {topic: number for (topic, *_), number in channels.items()})
+        writer.finish()
+    return out
+
+
 def rewrite(
     source: Path,
     out: Path,
     change: Callable[[str, int, bytes], bytes | None] = lambda topic, index, data: data,
     *,
     time: Callable[[str, int], int] = lambda topic, log_time: log_time,
-    order: Callable[[list[Any]], list[Any]] = list,
+    order: Callable[[list[Row]], list[Row]] = list,
     encode: Callable[[str, int, bytes], tuple[str, bytes]] | None = None,
     silent: bool = False,
     **options: Any,
 ) -> Path:
-    """Copy a log message by message, as another kind of MCAP file; options: of mcap.writer.Writer.
+    """Copy a log message by message, as another kind of MCAP file; options: of `write_mcap`.
 
     change: (topic, index in topic, data) -> the data to write, None to drop it; time: (topic, log time) -> log time;
     order: changes which message follows which; encode: (topic, index, schema) -> another message encoding and
     schema; silent: whether a topic without messages keeps its channel.
     """
-    with source.open("rb") as stream, out.open("wb") as file:
-        writer, channels, counts = Writer(file, **options), dict[Any, int](), Counter[str]()
-        writer.start(profile="ros2", library="test")
-        for schema, channel, message in order(list(make_reader(stream).iter_messages())):
-            topic, index = channel.topic, counts[channel.topic]
+    counts = Counter[str]()
+
+    def rows() -> Iterator[Row]:
+        for topic, encoding, (name, form, text), log_time, data in order(mcap_rows(source)):
+            index = counts[topic]
             counts[topic] += 1
-            own = encode(topic, index, schema.data) if encode else (channel.message_encoding, schema.data)
-            data, key = change(topic, index, message.data), (topic, *own)
-            if key not in channels and (silent or data is not None):
-                known = writer.register_schema(schema.name, schema.encoding, key[2])
-                channels[key] = writer.register_channel(topic, key[1], known)
-            if data is not None:
-                writer.add_message(channels[key], time(topic, message.log_time), data, message.publish_time)
-        writer.finish()
-    return out
+            changed = change(topic, index, data)
+            if encode:
+                encoding, text = encode(topic, index, text)
+            if silent or changed is not None:
+                yield topic, encoding, (name, form, text), time(topic, log_time), changed
+
+    return write_mcap(out, rows(), **options)
 
 
 def edit_of(topic: str, schema: str, edit: Callable[[int, Any], object]) -> Callable[[str, int, bytes], bytes]:

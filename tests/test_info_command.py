@@ -7,14 +7,12 @@ import shlex
 import numpy as np
 import pytest
 import yaml
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from flow.config.loader import SHIPPED
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import read_disparity
-from tests.conftest import FRAMES, roverflow
+from tests.conftest import FRAMES, mcap_rows, roverflow, write_mcap
 from tests.recordings.sample_log import LEFT, RIGHT, TILT, dropped, write_sample
 
 
@@ -59,18 +57,8 @@ def numbers(message):
 
 def with_copies(log, out, twice, moved):
     """A log with some topics also below /more, and others only below /one and /two."""
-    with log.open("rb") as stream, out.open("wb") as file:
-        writer, channels = Writer(file), {}
-        writer.start(profile="ros2")
-        for schema, channel, message in make_reader(stream).iter_messages():
-            folders = ["/one", "/two"] if channel.topic in moved else ["", "/more"] if channel.topic in twice else [""]
-            for topic in (f"{folder}{channel.topic}" for folder in folders):
-                if topic not in channels:
-                    known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[topic] = writer.register_channel(topic, "cdr", known)
-                writer.add_message(channels[topic], message.log_time, message.data, message.publish_time)
-        writer.finish()
-    return out
+    folders = {**dict.fromkeys(twice, ("", "/more")), **dict.fromkeys(moved, ("/one", "/two"))}
+    return write_mcap(out, [(f + topic, *row) for topic, *row in mcap_rows(log) for f in folders.get(topic, [""])])
 
 
 CAMERA = {

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 from zstandard import ZstdCompressor
 
@@ -19,6 +18,7 @@ from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
 from stages.data import CameraModel, Pose, Transform
+from tests.conftest import Extra, rewrite
 
 WIDTH, HEIGHT = 24, 16
 BASELINE = 0.25
@@ -130,20 +130,9 @@ def items_of(path: Path | Sequence[Path], source: McapSource | None = None, **bo
         return list(log.events())
 
 
-def with_extra(path: Path, extra: Callable[[Writer, dict[str, int]], object], **options: Any) -> Path:
-    """Write the log with something more. extra: is called with the writer and topic -> channel; options: of Writer."""
-    sample = write_sample(path.with_name("sample.mcap"))
-    with sample.open("rb") as stream, path.open("wb") as out:
-        writer, channels = Writer(out, **options), dict[str, int]()
-        writer.start(profile="ros2")
-        for schema, channel, message in make_reader(stream).iter_messages():
-            if channel.topic not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "cdr", known)
-            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
-        extra(writer, channels)
-        writer.finish()
-    return path
+def with_extra(path: Path, extra: Extra, **options: Any) -> Path:
+    """Write the log with something more. extra, options: of `write_mcap`."""
+    return rewrite(write_sample(path.with_name("sample.mcap")), path, extra=extra, **options)
 
 
 def inventory_of(path: Path, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:

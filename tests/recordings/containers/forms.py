@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from mcap.reader import make_reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from recordings.ros2.cdr import standard_types
+from tests.conftest import mcap_rows
 from tests.recordings.encodings.rewritten import ROS1, as_ros1
 
 Row = tuple[str, str, int, bytes]  # topic, type, log time, data
@@ -18,12 +18,7 @@ Row = tuple[str, str, int, bytes]  # topic, type, log time, data
 
 def rows_of(log: Path) -> list[Row]:
     """The messages of an MCAP log in the order of log time."""
-    with log.open("rb") as file:
-        return [
-            (channel.topic, schema.name, message.log_time, message.data)
-            for schema, channel, message in make_reader(file).iter_messages()
-            if schema
-        ]
+    return [(topic, schema[0], log_time, data) for topic, _, schema, log_time, data in mcap_rows(log)]
 
 
 def write_rosbag2(

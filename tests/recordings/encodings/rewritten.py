@@ -4,17 +4,18 @@ import json
 from base64 import b64encode
 from collections.abc import Callable
 from importlib import import_module
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import foxglove_schemas_protobuf as schemas
 import numpy as np
 from google.protobuf.json_format import MessageToDict
-from mcap.writer import Writer as McapWriter
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.mcap.file import iter_decoded
+from tests.conftest import Row, write_mcap
 
 Convert = Callable[[str, Any], Any]  # (topic, message) -> Foxglove's message
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
@@ -35,19 +36,14 @@ def as_ros1(message: Any) -> Any:
 
 def ros1_in_mcap(source: Path, out: Path) -> Path:
     """ROS 1 messages in an MCAP file."""
-    with out.open("wb") as file:
-        writer, channels = McapWriter(file), dict[str, int]()
-        writer.start(profile="ros1", library="")
-        for topic, log_time, message in iter_decoded(source):
-            kind = message.__msgtype__
-            if topic not in channels:
-                text, _ = ROS1.generate_msgdef(kind, ros_version=1)
-                schema = writer.register_schema(kind.replace("/msg/", "/"), "ros1msg", text.encode())
-                channels[topic] = writer.register_channel(topic, "ros1", schema)
-            data = bytes(ROS1.serialize_ros1(as_ros1(message), kind))
-            writer.add_message(channels[topic], log_time, data, log_time)
-        writer.finish()
-    return out
+
+    def row(topic: str, log_time: int, message: Any) -> Row:
+        kind = message.__msgtype__
+        text = ROS1.generate_msgdef(kind, ros_version=1)[0].encode()
+        data = bytes(ROS1.serialize_ros1(as_ros1(message), kind))
+        return topic, "ros1", (kind.replace("/msg/", "/"), "ros1msg", text), log_time, data
+
+    return write_mcap(out, starmap(row, iter_decoded(source)), profile="ros1")
 
 
 def foxglove(name: str, header: Any = None, **fields: Any) -> Any:
@@ -141,20 +137,16 @@ def protobuf_log(source: Path, out: Path, convert: Convert = _converted) -> Path
 
 def json_log(source: Path, out: Path, convert: Convert = _converted) -> Path:
     """Foxglove's messages in JSON."""
-    with out.open("wb") as file:
-        writer, channels = McapWriter(file), dict[str, int]()
-        writer.start(profile="", library="")
-        for topic, log_time, message in iter_decoded(source):
-            is_imu = message.__msgtype__.endswith("Imu")
-            made = message if is_imu else convert(topic, message)
-            name = message.__msgtype__ if is_imu else made.DESCRIPTOR.full_name
-            if topic not in channels:
-                schema = writer.register_schema(name, "jsonschema", b"{}")
-                channels[topic] = writer.register_channel(_renamed(topic), "json", schema)
-            plain = ros_json(message) if is_imu else foxglove_json(made)
-            writer.add_message(channels[topic], log_time, json.dumps(plain).encode(), log_time)
-        writer.finish()
-    return out
+
+    def row(topic: str, log_time: int, message: Any) -> Row:
+        if message.__msgtype__.endswith("Imu"):
+            name, plain = message.__msgtype__, ros_json(message)
+        else:
+            made = convert(topic, message)
+            name, plain = made.DESCRIPTOR.full_name, foxglove_json(made)
+        return _renamed(topic), "json", (name, "jsonschema", b"{}"), log_time, json.dumps(plain).encode()
+
+    return write_mcap(out, starmap(row, iter_decoded(source)), profile="")
 
 
 def _renamed(topic: str) -> str:

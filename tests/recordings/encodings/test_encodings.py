@@ -13,7 +13,6 @@ from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorP
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from google.protobuf.timestamp_pb2 import Timestamp
-from mcap.writer import Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from recordings import McapSource
@@ -28,6 +27,7 @@ from recordings.ros2.tilt_from_msg import AngleField
 from recordings.ros2.to_msg import image
 from recordings.source.topics import MAX_CHANNELS
 from stages.data import Tilt
+from tests.conftest import write_mcap
 from tests.recordings.encodings.rewritten import WRITERS
 from tests.recordings.sample_log import essences, items_of
 
@@ -50,15 +50,9 @@ def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_
 
 def json_angles(path: Path, angles: list[dict[str, Any]], schema: bool) -> Path:
     """A log of JSON messages with plain angles."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="")
-        number = writer.register_schema("Tilt", "jsonschema", b"{}") if schema else 0
-        channel = writer.register_channel("/tilt", "json", number)
-        for count, message in enumerate(angles):
-            writer.add_message(channel, 10**9 + count, json.dumps(message).encode(), 10**9)
-        writer.finish()
-    return path
+    form = ("Tilt", "jsonschema", b"{}") if schema else None
+    rows = [("/tilt", "json", form, 10**9 + count, json.dumps(angle).encode()) for count, angle in enumerate(angles)]
+    return write_mcap(path, rows, profile="")
 
 
 def protobuf_angles(path: Path, seconds: int, nanoseconds: int, pitch: float) -> Path:
@@ -233,29 +227,17 @@ def test_compressed_messages_may_unpack_to_200_times_their_size_in_all(monkeypat
 
 
 def test_a_log_of_thousands_of_topics_opens_quickly(tmp_path):
-    with (tmp_path / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="")
-        for number in range(MAX_CHANNELS + 5):
-            schema = writer.register_schema(f"a/B{number}", "ros2msg", b"int32 x")
-            channel = writer.register_channel(f"/t{number}", "cdr", schema)
-        writer.add_message(channel, 10**9, b"\0\1\0\0\0\0\0\0", 10**9)
-        writer.finish()
-    with McapSource().open(tmp_path / "log.mcap") as log:
+    rows = [(f"/t{number}", "cdr", (f"a/B{number}", "ros2msg", b"int32 x"), 0, None) for number in range(MAX_CHANNELS)]
+    last = "/last", "cdr", ("a/Last", "ros2msg", b"int32 x"), 10**9, b"\0\1\0\0\0\0\0\0"
+    with McapSource().open(write_mcap(tmp_path / "log.mcap", [*rows, last])) as log:
         assert len(log.resolution.messages.decoders) == MAX_CHANNELS
         assert "the log has more than 1000 channels" in log.missing["left"]
 
 
 def test_schemas_are_parsed_up_to_a_limit_for_all(tmp_path, monkeypatch):
     monkeypatch.setattr("recordings.source.topics.MAX_SCHEMA_BYTES", 30)
-    with (tmp_path / "log.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="")
-        for number in range(3):
-            schema = writer.register_schema(f"a/B{number}", "ros2msg", b"int32 xxxxxx # " + b"comment" * 9)
-            channel = writer.register_channel(f"/t{number}", "cdr", schema)
-            writer.add_message(channel, 10**9, b"\0\1\0\0\0\0\0\0", 10**9)
-        writer.finish()
-    with McapSource().open(tmp_path / "log.mcap") as log:
+    text, data = b"int32 xxxxxx # " + b"comment" * 9, b"\0\1\0\0\0\0\0\0"
+    rows = [(f"/t{number}", "cdr", (f"a/B{number}", "ros2msg", text), 10**9, data) for number in range(3)]
+    with McapSource().open(write_mcap(tmp_path / "log.mcap", rows)) as log:
         assert list(log.resolution.messages.schemas) == ["/t0", "/t1"]
         assert "the schemas of the log have more than 30 bytes" in log.missing["left"]

@@ -1,6 +1,5 @@
 """Damaged and foreign logs: the readable part is read correctly, the rest is reported as lost."""
 
-import io
 import json
 import math
 import re
@@ -17,7 +16,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Statistics
-from mcap.writer import CompressionType, IndexType, Writer
+from mcap.writer import CompressionType, IndexType
 
 from recordings import McapSource
 from recordings.containers.container import LostMessage
@@ -26,7 +25,7 @@ from recordings.inventory.text import format_description
 from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
-from tests.conftest import rewrite
+from tests.conftest import rewrite, write_mcap
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essences, inventory_of, items_of, sound
 
 
@@ -290,13 +289,8 @@ def test_a_missing_file_a_folder_and_an_empty_log_are_refused(tmp_path):
         McapSource().open(tmp_path / "none.mcap")
     with pytest.raises(LogError, match="contains no recording"):
         McapSource().open(tmp_path)
-    stream = io.BytesIO()
-    writer = Writer(stream)
-    writer.start()
-    writer.finish()
-    (tmp_path / "no.mcap").write_bytes(stream.getvalue())
     with pytest.raises(LogError, match=r"no\.mcap contains no messages"):
-        McapSource().open(tmp_path / "no.mcap")
+        McapSource().open(write_mcap(tmp_path / "no.mcap", []))
 
 
 def test_every_real_log_is_described_or_refused():
@@ -323,15 +317,8 @@ def test_the_field_log_has_its_tilt_at_ten_hertz():
 
 
 def test_messages_of_an_undefined_channel_are_reported(tmp_path):
-    log = tmp_path / "log.mcap"
-    with log.open("wb") as file:
-        writer = Writer(file, use_chunking=False, use_statistics=False)
-        writer.start()
-        schema = writer.register_schema("a/A", "ros2msg", b"int8 a")
-        known = writer.register_channel("/a", "cdr", schema)
-        for time in range(1, 4):
-            writer.add_message(known, time, b"\0\1\0\0\0", time)
-        writer.finish()
+    rows, known = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in range(1, 4)], 1
+    log = write_mcap(tmp_path / "log.mcap", rows, use_chunking=False, use_statistics=False)
     content = bytearray(log.read_bytes())
     place = content.index(struct.pack("<BQHIQ", 5, 27, known, 0, 2))
     struct.pack_into("<H", content, place + 9, 999)

@@ -22,14 +22,13 @@ from recordings.mcap import chunk, message_order, walk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MESSAGE
 from recordings.ros2.cdr import make
-from tests.conftest import rewrite
+from tests.conftest import Extra, rewrite
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
 from tests.recordings import sample_log
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
 from tests.recordings.sample_log import LEFT, START, TILT, essences, items_of, sound, write_sample
 
-Extra = Callable[[Writer, dict[str, int]], object]
 NOTHING = b"\0\1\0\0" + bytes(8)
 MILLISECOND = 1_000_000
 

@@ -6,15 +6,14 @@ import pytest
 from mcap.reader import make_reader
 
 from recordings.mcap.file import iter_decoded
-from tests.conftest import SMALL, rewrite, roverflow
+from tests.conftest import SMALL, mcap_rows, rewrite, roverflow
 
 
 def contents(path):
     """(Topic, encoding, schema) -> its (log time, bytes)."""
     found = defaultdict(list)
-    with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages():
-            found[channel.topic, channel.message_encoding, schema.data].append((message.log_time, message.data))
+    for *channel, log_time, data in mcap_rows(path):
+        found[tuple(channel)].append((log_time, data))
     return found
 
 

@@ -51,6 +51,7 @@ from stages.data import (
     StereoCamera,
     Transform,
 )  # fmt: skip
+from tests.recordings.containers.forms import rows_of
 from tests.recordings.ros2.idl import idl_schema
 from tests.recordings.sample_log import data_folder, model, write_sample
 
@@ -322,12 +323,10 @@ def test_a_schema_may_leave_out_standard_types():
 
 def test_idl_schemas_of_rosidl_are_read(tmp_path):
     seen = set()
-    with write_sample(tmp_path / "log.mcap").open("rb") as log:
-        for schema, _, message in make_reader(log).iter_messages():
-            assert schema is not None
-            decoded = decoder_for(schema.name, "ros2idl", idl_schema(schema.name))(message.data)
-            assert bytes(standard_types().serialize_cdr(decoded, schema.name)) == message.data
-            seen.add(schema.name.rpartition("/")[2])
+    for _, kind, _, data in rows_of(write_sample(tmp_path / "log.mcap")):
+        decoded = decoder_for(kind, "ros2idl", idl_schema(kind))(data)
+        assert bytes(standard_types().serialize_cdr(decoded, kind)) == data
+        seen.add(kind.rpartition("/")[2])
     assert seen == {"Image", "CameraInfo", "Imu", "Odometry", "TFMessage"}
 
 

@@ -2,18 +2,19 @@
 
 from collections.abc import Callable
 from fractions import Fraction
+from itertools import starmap
 from pathlib import Path
 from typing import Any
 
 import av
 import cv2
 import numpy as np
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.cdr import standard_types
 from recordings.ros2.image_from_msg import pixels_of
+from tests.conftest import Row, write_mcap
 from tests.recordings.encodings.rewritten import as_foxglove, foxglove, json_log, protobuf_log
 
 KEY_INTERVAL = 3  # frames from one key frame to the next
@@ -66,22 +67,18 @@ def cdr_log(source: Path, out: Path, convert: Callable[[str, Any], Any]) -> Path
     """A ROS 2 log with Foxglove's messages of video."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     store.register(get_types_from_msg(VIDEO_TEXT, VIDEO))
-    with out.open("wb") as file:
-        writer, channels = Writer(file), dict[str, int]()
-        writer.start(profile="ros2", library="")
-        for topic, log_time, message in iter_decoded(source):
-            kind, types = message.__msgtype__, standard_types()
-            if kind.endswith("/Image"):
-                made, kind, types = convert(topic, message), VIDEO, store
-                data = np.frombuffer(made.data, np.uint8)
-                time = store.types["builtin_interfaces/msg/Time"](made.timestamp.seconds, made.timestamp.nanos)
-                message = store.types[VIDEO](time, made.frame_id, data, made.format)
-            if topic not in channels:
-                schema = writer.register_schema(kind, "ros2msg", types.generate_msgdef(kind, ros_version=2)[0].encode())
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic], log_time, bytes(types.serialize_cdr(message, kind)), log_time)
-        writer.finish()
-    return out
+
+    def row(topic: str, log_time: int, message: Any) -> Row:
+        kind, types = message.__msgtype__, standard_types()
+        if kind.endswith("/Image"):
+            made, kind, types = convert(topic, message), VIDEO, store
+            data = np.frombuffer(made.data, np.uint8)
+            time = store.types["builtin_interfaces/msg/Time"](made.timestamp.seconds, made.timestamp.nanos)
+            message = store.types[VIDEO](time, made.frame_id, data, made.format)
+        text = types.generate_msgdef(kind, ros_version=2)[0].encode()
+        return topic, "cdr", (kind, "ros2msg", text), log_time, bytes(types.serialize_cdr(message, kind))
+
+    return write_mcap(out, starmap(row, iter_decoded(source)))
 
 
 def video_log(source: Path, out: Path, video_format: str, encoding: str = "protobuf") -> Path:
