@@ -13,7 +13,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import read_disparity
 from tests.conftest import FRAMES, mcap_rows, roverflow, write_mcap
-from tests.recordings.sample_log import LEFT, RIGHT, TILT, dropped, write_sample
+from tests.recordings.sample_log import INFOS, LEFT, RIGHT, TILT, changed, dropped, replaced, write_sample
 
 
 def test_info_describes_a_log(traverse, said):
@@ -39,10 +39,10 @@ def test_info_reports_why_a_run_would_refuse_the_log(traverse, said, refused):
 CAMERA_TOPICS = ("image_rect", "camera_info")
 REFUSED = {
     "names": {"names": ("/a/picture", "/b/picture")},
-    "no calibration": {"edit": dropped("/stereo/left/camera_info", "/stereo/right/camera_info")},
-    "no tilt": {"edit": dropped(TILT)},
-    "no mount": {"edit": dropped("/tf_static")},
-    "bare numbers": {"edit": lambda topic, number, message: numbers(message) if topic == TILT else message},
+    "no calibration": {"edits": [dropped(*INFOS)]},
+    "no tilt": {"edits": [dropped(TILT)]},
+    "no mount": {"edits": [dropped("/tf_static")]},
+    "bare numbers": {"edits": [replaced(TILT, lambda message: numbers(message))]},
     "two tilts": {"twice": [TILT]},
     "two pairs": {"twice": [f"/stereo/{side}/{kind}" for side in ("left", "right") for kind in CAMERA_TOPICS]},
     "two calibrations elsewhere": {"moved": ["/stereo/right/camera_info"]},
@@ -72,8 +72,8 @@ KALIBR = {"cam0": CAMERA, "cam1": {**CAMERA, "T_cn_cnm1": RIGHT_FROM_LEFT}}
 @pytest.mark.parametrize("fault", REFUSED)
 def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, tmp_path, said):
     changes, file = dict(REFUSED[fault]), tmp_path / "calibration.yaml"
-    copies = [changes.pop(kind, []) for kind in ("twice", "moved")]
-    log = with_copies(write_sample(tmp_path / "sample.mcap", **changes), tmp_path / "log.mcap", *copies)
+    edits, *copies = [changes.pop(kind, []) for kind in ("edits", "twice", "moved")]
+    log = with_copies(write_sample(tmp_path / "sample.mcap", *edits, **changes), tmp_path / "log.mcap", *copies)
     file.write_text(json.dumps(KALIBR))  # JSON is YAML
     offered = said(2, "info", log).out.partition("what would supply it:\n")[2].splitlines()
     commands = {line: shlex.split(line.partition("  (")[0].replace("=FILE", f"={file}")) for line in offered}
@@ -133,11 +133,7 @@ def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, said):
 
 
 def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, said):
-    def edit(topic, number, message):
-        if topic in (RIGHT, TILT):
-            message.header.stamp.nanosec += 8_000_000
-        return message
-
+    edit = changed((RIGHT, TILT), {"header.stamp.nanosec": lambda time: time + 8_000_000})
     log, pipeline = write_sample(tmp_path / "log.mcap", edit), tmp_path / "named.yaml"
 
     def frames(*given):

@@ -16,6 +16,7 @@ from zstandard import ZstdCompressor
 from recordings import McapSource
 from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
+from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
 from stages.data import CameraModel, Pose, Transform
 from tests.conftest import Extra, rewrite
@@ -26,6 +27,7 @@ FRAMES = 5
 PERIOD = 100_000_000
 START = 1_700_000_000_000_000_000
 LEFT, RIGHT, TILT = "/stereo/left/image_rect", "/stereo/right/image_rect", "/imu/data"
+INFOS = "/stereo/left/camera_info", "/stereo/right/camera_info"
 UNSTAMPED = {"header.stamp.sec": 0, "header.stamp.nanosec": 0}  # for `changed`
 
 
@@ -82,14 +84,13 @@ LAYOUTS: dict[str, dict[str, Any]] = {
 }
 
 
-def write_sample(
-    path: Path, edit: Edit = lambda topic, number, message: message, names: tuple[str, str] = (LEFT, RIGHT)
-) -> Path:
-    """Write the log. edit: replaces a message (by topic and frame number), or leaves it out by returning None."""
+def write_sample(path: Path, *edits: Edit, names: tuple[str, str] = (LEFT, RIGHT)) -> Path:
+    """Write the log. edits: each replaces a message (by topic and frame number), or leaves it out by returning None."""
     with Ros2Writer(path) as writer:
 
         def write(topic: str, number: int, message: Any, stamp: int) -> None:
-            message = edit(topic, number, message)
+            for edit in edits:
+                message = None if message is None else edit(topic, number, message)
             if message is not None:
                 writer.write(topic, message, stamp)
 
@@ -108,21 +109,41 @@ def write_sample(
 
 
 def changed(topic: str | tuple[str, ...], values: dict[str, Any], numbers: Collection[int] = range(FRAMES)) -> Edit:
-    """An edit for `write_sample`: sets fields, by their paths, in messages of topics that end so, in some frames."""
+    """An edit for `write_sample`: sets fields, by their paths, in messages of topics that end so, in some frames.
+
+    A value may be a function of the old value.
+    """
 
     def edit(name: str, number: int, message: Any) -> Any:
         if name.endswith(topic) and number in numbers:
             for path, value in values.items():
                 *parents, field = path.split(".")
-                setattr(attrgetter(".".join(parents))(message) if parents else message, field, value)
+                owner = attrgetter(".".join(parents))(message) if parents else message
+                setattr(owner, field, value(getattr(owner, field)) if callable(value) else value)
         return message
 
     return edit
 
 
-def dropped(*prefixes: str) -> Edit:
-    """An edit for `write_sample` that leaves out the topics with these prefixes."""
-    return lambda topic, number, message: None if topic.startswith(prefixes) else message
+def dropped(*prefixes: str, numbers: Collection[int] = range(FRAMES)) -> Edit:
+    """An edit for `write_sample` that leaves out the topics with these prefixes in some frames."""
+    return lambda topic, number, message: None if topic.startswith(prefixes) and number in numbers else message
+
+
+def replaced(topic: str | tuple[str, ...], change: Callable[[Any], Any]) -> Edit:
+    """An edit for `write_sample`: other messages, made of the old ones, on topics that end so."""
+    return lambda name, number, message: change(message) if name.endswith(topic) else message
+
+
+def compressed(topic: str, data: bytes) -> Edit:
+    """An edit for `write_sample`: one compressed image in place of each."""
+    kind, pixels = "sensor_msgs/msg/CompressedImage", np.frombuffer(data, np.uint8)
+    return replaced(topic, lambda message: make(kind, header=message.header, format="png", data=pixels))
+
+
+def mounted(*transforms: Transform) -> Edit:
+    """An edit for `write_sample`: other static transforms."""
+    return replaced("/tf_static", lambda message: transform_message([(each, START) for each in transforms]))
 
 
 def items_of(path: Path | Sequence[Path], source: McapSource | None = None, **bounds: float) -> list[Event]:

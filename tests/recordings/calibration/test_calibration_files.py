@@ -13,7 +13,7 @@ from recordings import McapSource
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
 from tests.recordings.calibration.euroc_bag import euroc_bag, euroc_rosbag2, kalibr_camchain
-from tests.recordings.sample_log import HEIGHT, LEFT, RIGHT, WIDTH, data_folder, dropped, items_of, write_sample
+from tests.recordings.sample_log import HEIGHT, INFOS, LEFT, RIGHT, WIDTH, data_folder, dropped, items_of, write_sample
 
 INTRINSICS = [[458.6, 457.3, 367.2, 248.4], [457.6, 456.1, 379.9, 255.2]]
 K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in INTRINSICS]
@@ -123,7 +123,7 @@ def camera_info(name: str, shift: float) -> dict[str, Any]:
 
 def calibrated_by_ros(folder: Path, shift: float) -> tuple[Path, McapSource]:
     """A log without CameraInfo, and a source with two files instead; shift: P[0, 3] of the right camera."""
-    log = write_sample(folder / "log.mcap", dropped("/stereo/left/camera_info", "/stereo/right/camera_info"))
+    log = write_sample(folder / "log.mcap", dropped(*INFOS))
     contents = {side: camera_info(side, to) for side, to in (("left", 0.0), ("right", shift))}
     files = [written(folder / f"{side}.yaml", content) for side, content in contents.items()]
     return log, McapSource(calibration=tuple(map(str, files)))
@@ -149,7 +149,7 @@ def test_files_with_the_right_camera_first_and_a_pair_without_baseline_are_named
 
 
 def test_a_camchain_with_the_right_camera_first_is_read_by_its_topics(tmp_path):
-    log = write_sample(tmp_path / "log.mcap", dropped("/stereo/left/camera_info", "/stereo/right/camera_info"))
+    log = write_sample(tmp_path / "log.mcap", dropped(*INFOS))
     (path,) = kalibr(tmp_path)
     cams = yaml.safe_load(path.read_text())
     cams["cam1"]["T_cn_cnm1"] = rigid([0, 0, 0], [0.25, 0, 0]).tolist()

@@ -8,7 +8,6 @@ import pytest
 
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
-from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import camera_info, image, odometry, transform_message
 from stages.data import Pose, Transform
 from tests.recordings.sample_log import (
@@ -19,6 +18,7 @@ from tests.recordings.sample_log import (
     START,
     TILT,
     changed,
+    compressed,
     items_of,
     model,
     picture,
@@ -57,13 +57,7 @@ def test_two_stereo_cameras_are_equally_good(tmp_path):
 
 
 def test_one_camera_may_send_its_images_compressed(tmp_path):
-    packed = cv2.imencode(".png", picture(0))[1].ravel()
-
-    def edit(topic, number, message):
-        if topic != LEFT:
-            return message
-        return make("sensor_msgs/msg/CompressedImage", header=message.header, format="png", data=packed)
-
+    edit = compressed(LEFT, cv2.imencode(".png", picture(0))[1].tobytes())
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert (log.topics["left"], log.topics["right"]) == (LEFT, RIGHT)
         assert [item.pixels.shape for _, _, item in log.events(["left"])] == [picture(0).shape] * FRAMES

@@ -15,12 +15,12 @@ from recordings.containers.opening import open_recording
 from recordings.inventory.text import format_description
 from recordings.mcap.chunk import HEAD_BYTES
 from recordings.mcap.file import McapFile
-from recordings.ros2.to_msg import transform_message
 from stages.data import Transform
 from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
+    INFOS,
     LAYOUTS,
     LEFT,
     PERIOD,
@@ -32,6 +32,7 @@ from tests.recordings.sample_log import (
     changed,
     dropped,
     inventory_of,
+    mounted,
     write_sample,
 )
 
@@ -74,14 +75,11 @@ def test_the_text_lists_topics_streams_and_missing_streams(tmp_path):
 
 
 def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path):
-    def edit(topic, number, message):
-        if topic == RIGHT and number in (1, 2):
-            message.header.stamp.nanosec += 6_000_000 if number == 1 else 4_000_000
-        if topic == TILT and number in (1, 2, 3):
-            return None
-        return message
-
-    path = write_sample(tmp_path / "log.mcap", edit)
+    later = [
+        changed(RIGHT, {"header.stamp.nanosec": lambda time: time + 6_000_000}, [1]),
+        changed(RIGHT, {"header.stamp.nanosec": lambda time: time + 4_000_000}, [2]),
+    ]
+    path = write_sample(tmp_path / "log.mcap", *later, dropped(TILT, numbers=[1, 2, 3]))
     frames = inventory_of(path)["frames"]
     assert frames["pairs"] == FRAMES - 1
     assert frames["with_tilt"] == 2  # the first and the last frame have a tilt at their stamp
@@ -93,11 +91,7 @@ def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path):
 
 
 def test_repeated_stamps_count_once_and_are_reported(tmp_path):
-    def edit(topic, number, message):
-        if topic in (LEFT, RIGHT, TILT) and number == 2:
-            message.header.stamp.nanosec -= PERIOD
-        return message
-
+    edit = changed((LEFT, RIGHT, TILT), {"header.stamp.nanosec": lambda time: time - PERIOD}, [2])
     described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
     frames = described["frames"]
     assert (frames["left"], frames["right"]) == (FRAMES, FRAMES)
@@ -107,20 +101,15 @@ def test_repeated_stamps_count_once_and_are_reported(tmp_path):
 
 
 def test_without_cameras_no_pairs_are_reported(tmp_path):
-    edit = lambda topic, _, message: None if topic.endswith("camera_info") else message  # noqa: E731
-    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
+    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", dropped(*INFOS))))
     assert "missing: left: no CameraInfo belongs to" in text
     assert "frames:" not in text
 
 
 def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path):
-    def edit(topic, number, message):
-        if topic == TILT and number:
-            message.orientation.x = message.orientation.y = message.orientation.z = 0.0
-            message.orientation.w = 0.0 if number < 3 else 0.25
-        return message
-
-    described = inventory_of(write_sample(tmp_path / "log.mcap", edit))
+    zero = changed(TILT, {f"orientation.{name}": 0.0 for name in "xyzw"}, range(1, FRAMES))
+    other = changed(TILT, {"orientation.w": 0.25}, range(3, FRAMES))
+    described = inventory_of(write_sample(tmp_path / "log.mcap", zero, other))
     assert len(described["damage"]) == FRAMES - 1
     (line,) = (line for line in format_description(described).splitlines() if line.startswith("damaged"))
     assert line.startswith(
@@ -164,18 +153,10 @@ def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
     ],
 )  # fmt: skip
 def test_a_baseline_from_or_against_the_transform_is_noted(tmp_path, errors, told_by_transform, note):
-    def edit(topic, number, message):
-        if topic == "/tf_static":
-            beside = Transform("left_optical", "right_optical", np.eye(3), [told_by_transform, 0, 0])
-            return transform_message([(transform, START) for transform in (*TRANSFORMS, beside)])
-        if topic == "/stereo/right/camera_info":
-            message.p = message.p.copy()
-            message.p[3] = -20 * errors
-        if topic == RIGHT:
-            message.header.stamp.sec = message.header.stamp.nanosec = 0
-        return message
-
-    path = write_sample(tmp_path / "log.mcap", edit)
+    beside = Transform("left_optical", "right_optical", np.eye(3), [told_by_transform, 0, 0])
+    by_p = changed("right/camera_info", {"p": lambda p: np.where(np.arange(12) == 3, -20 * errors, p)})
+    edits = mounted(*TRANSFORMS, beside), by_p, changed(RIGHT, UNSTAMPED)
+    path = write_sample(tmp_path / "log.mcap", *edits)
     described = inventory_of(path)
     assert described["calibration"]["baseline"] == pytest.approx(errors or told_by_transform)
     unstamped = "the header stamps are 0, so log times are used"
@@ -207,8 +188,8 @@ def test_undecodable_topics_are_listed_once(tmp_path):
 
 
 def test_singular_and_plural_are_correct(tmp_path):
-    edit = lambda topic, number, message: None if number else message  # noqa: E731
-    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
+    one = dropped("", numbers=range(1, FRAMES))
+    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", one)))
     assert "1 stereo pair (stamps within 5 ms) from 1 left image and 1 right image; 1 left image with" in text
 
 

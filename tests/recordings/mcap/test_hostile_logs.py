@@ -21,13 +21,12 @@ from recordings.errors import LogError
 from recordings.mcap import chunk, message_order, walk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MESSAGE
-from recordings.ros2.cdr import make
 from tests.conftest import Extra, rewrite
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
 from tests.recordings import sample_log
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
-from tests.recordings.sample_log import LEFT, START, TILT, essences, items_of, sound, write_sample
+from tests.recordings.sample_log import LEFT, START, TILT, changed, compressed, essences, items_of, sound, write_sample
 
 NOTHING = b"\0\1\0\0" + bytes(8)
 MILLISECOND = 1_000_000
@@ -40,16 +39,8 @@ def with_extra(extra: Extra, **options: Any) -> Callable[[Path], Path]:
 
 def images(data: bytes, size: int) -> Callable[[Path], Path]:
     """The sample with a compressed image in place of each, and calibrations of its size."""
-
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic.endswith("camera_info"):
-            message.width = message.height = size
-        elif topic.endswith("image_rect"):
-            pixels = np.frombuffer(data, np.uint8)
-            return make("sensor_msgs/msg/CompressedImage", header=message.header, format="png", data=pixels)
-        return message
-
-    return lambda folder: write_sample(folder / "log.mcap", edit)
+    edits = compressed("image_rect", data), changed("camera_info", {"width": size, "height": size})
+    return lambda folder: write_sample(folder / "log.mcap", *edits)
 
 
 def png(size: int, bits: int = 8, colour: int = 0) -> bytes:

@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,18 @@ from recordings.ros2.to_msg import transform_message
 from recordings.source.calibration import calibrated_pair
 from recordings.source.transforms import TransformTree
 from stages.data import CameraModel, Transform
-from tests.recordings.sample_log import FRAMES, START, TRANSFORMS, changed, tilt_quaternion, write_sample
+from tests.recordings.sample_log import (
+    FRAMES,
+    START,
+    TRANSFORMS,
+    changed,
+    dropped,
+    model,
+    mounted,
+    replaced,
+    tilt_quaternion,
+    write_sample,
+)
 
 RAW = ("/left/image_raw", "/right/image_raw")
 RECTIFIED = ("/left/image_rect", "/right/image_rect")
@@ -24,16 +34,9 @@ RECTIFIED = ("/left/image_rect", "/right/image_rect")
 def single_calibrations(path: Path, names: tuple[str, str], beside: Transform, fx: float = 20.0) -> Path:
     """Two single calibrations without distortion; `beside` places the right one in the left's frame."""
 
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == "/tf_static":
-            return transform_message([(transform, START) for transform in (*TRANSFORMS, beside)])
-        if topic.endswith("camera_info"):
-            message.p = np.zeros(12)
-            if topic.startswith("/right"):
-                message.k[[0, 4]] = fx
-        return message
-
-    return write_sample(path, edit, names=names)
+    wide = {"k": lambda k: np.where(np.isin(np.arange(9), (0, 4)), fx, k)}
+    edits = changed("camera_info", {"p": np.zeros(12)}), changed("right/camera_info", wide)
+    return write_sample(path, mounted(*TRANSFORMS, beside), *edits, names=names)
 
 
 def turned(axis: str, degrees: float) -> np.ndarray:
@@ -139,17 +142,9 @@ def test_a_calibration_with_only_p_means_rectified_images(tmp_path, distorted):
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
-@pytest.mark.parametrize(
-    ("place", "value", "sentence"), [((0, 0), 18.6, "fx is 20 and 18.6"), ((1, 2), 8.5, "cy is 7.5")]
-)
+@pytest.mark.parametrize(("place", "value", "sentence"), [(0, 18.6, "fx is 20 and 18.6"), (6, 8.5, "cy is 7.5")])
 def test_projections_of_no_rectified_pair_are_refused(tmp_path, names, place, value, sentence):
-    def edit(topic, number, message):
-        if topic == "/right/camera_info":
-            p = np.array(message.p).reshape(3, 4)
-            p[place] = value
-            message.p = p.reshape(-1)
-        return message
-
+    edit = changed("/right/camera_info", {"p": lambda p: np.where(np.arange(12) == place, value, p)})
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
         assert f"does not belong to a rectified pair: {sentence}" in log.missing["left"]
 
@@ -168,15 +163,8 @@ def test_lenses_without_a_rectified_image_are_refused():
 def test_a_rectified_image_has_its_own_frame_if_r_rotates_it(tmp_path):
     """Transforms and poses of the camera's own frame are rotated by R."""
     by = turned("y", 2.0) @ turned("x", -1.0)
-
-    def edit(topic, number, message):
-        if topic.endswith("camera_info"):
-            message.r = by.ravel()
-        if topic == "/odom":
-            message.child_frame_id = "left_optical"
-        return message
-
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RECTIFIED)) as log:
+    edits = changed("camera_info", {"r": by.ravel()}), changed("/odom", {"child_frame_id": "left_optical"})
+    with McapSource().open(write_sample(tmp_path / "log.mcap", *edits, names=RECTIFIED)) as log:
         found = {stream: item for _, stream, item in log.events() if stream in ("left", "mount", "odometry")}
         camera, mount, pose = found["left"], found["mount"].base_from_camera, found["odometry"]
     assert camera.frame_id == mount.child == pose.child_frame_id == "left_optical_rectified"
@@ -191,15 +179,8 @@ def test_a_rectified_image_has_its_own_frame_if_r_rotates_it(tmp_path):
 def test_a_pose_is_transformed_to_the_rover_or_its_camera(tmp_path, with_base):
     camera, inclinometer = TRANSFORMS
     on_camera = camera.inverse().after(inclinometer)
-
-    def edit(topic, number, message):
-        if topic == "/odom":
-            message.child_frame_id = "imu_link"
-        if topic == "/tf_static" and not with_base:
-            return transform_message([(on_camera, START)])
-        return message
-
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+    edits = changed("/odom", {"child_frame_id": "imu_link"}), mounted(*(TRANSFORMS if with_base else [on_camera]))
+    with McapSource().open(write_sample(tmp_path / "log.mcap", *edits)) as log:
         assert log.missing == {}
         assert ("mount" in log.notes()) == (not with_base)
         poses = [item for _, _, item in log.events(["odometry"])]
@@ -222,11 +203,7 @@ def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path):
         assert "joins the camera to 'base_link' only; set it to one of these" in log.refused["base_frame"]
     with McapSource(base_frame="imu_link").open(write_sample(tmp_path / "log.mcap")) as log:
         assert log.refused == {}
-
-    def bare(topic, number, message):
-        between = TRANSFORMS[0].inverse().after(TRANSFORMS[1])
-        return transform_message([(between, START)]) if topic == "/tf_static" else message
-
+    bare = mounted(TRANSFORMS[0].inverse().after(TRANSFORMS[1]))
     with McapSource(base_frame="rover").open(write_sample(tmp_path / "log.mcap", bare)) as log:
         assert log.refused == {}  # the log has no better one
         assert "no static transform joins 'rover' and the camera" in log.notes()["mount"]
@@ -240,13 +217,9 @@ def test_a_pose_in_a_frame_of_the_rover_is_refused(tmp_path, problems, resting):
 
 
 def test_frames_without_names_are_not_connected(tmp_path):
-    def edit(topic, number, message):
-        if hasattr(message, "header"):
-            message.header.frame_id = ""
-        return None if topic == "/tf_static" else message
-
+    edits = dropped("/tf_static"), changed("", {"header.frame_id": ""})
     assert TransformTree().between("", "") is None
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+    with McapSource().open(write_sample(tmp_path / "log.mcap", *edits)) as log:
         assert log.resolution.mount is None
         assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
 
@@ -256,15 +229,6 @@ def test_a_calibration_without_a_frame_has_that_of_its_images(tmp_path):
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
         assert [camera.frame_id for camera in log.resolution.cameras or ()] == ["left_optical", "right_optical"]
-
-
-def with_transforms(path: Path, *more: Transform) -> Path:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic == "/tf_static":
-            return transform_message([(transform, START) for transform in (*TRANSFORMS, *more)])
-        return message
-
-    return write_sample(path, edit)
 
 
 @pytest.mark.parametrize(
@@ -279,7 +243,7 @@ def with_transforms(path: Path, *more: Transform) -> Path:
     ],
 )
 def test_an_invalid_transform_is_reported_and_left_out(tmp_path, more, sentence):
-    with McapSource().open(with_transforms(tmp_path / "log.mcap", more)) as log:
+    with McapSource().open(write_sample(tmp_path / "log.mcap", mounted(*TRANSFORMS, more))) as log:
         assert log.missing == {}
         assert log.resolution.mount is not None
         np.testing.assert_allclose(
@@ -292,12 +256,11 @@ def test_an_invalid_transform_is_reported_and_left_out(tmp_path, more, sentence)
 
 
 def test_an_infinite_translation_is_reported_and_left_out(tmp_path):
-    def edit(topic, number, message):
-        if topic == "/tf_static":
-            message.transforms[0].transform.translation.x = np.nan
+    def broken(message):
+        message.transforms[0].transform.translation.x = np.nan
         return message
 
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+    with McapSource().open(write_sample(tmp_path / "log.mcap", replaced("/tf_static", broken))) as log:
         assert "no static transform joins the camera" in log.missing["mount"]
         problems = [str(item) for _, _, item in log.events() if isinstance(item, Exception)]
     what = "the translation of the transform 'base_link' <- 'left_optical'"
@@ -320,17 +283,14 @@ def test_a_long_chain_of_transforms_is_followed():
 
 
 def test_a_repeated_transform_is_no_contradiction(tmp_path):
-    with McapSource().open(with_transforms(tmp_path / "log.mcap", *TRANSFORMS, TRANSFORMS[0].inverse())) as log:
+    edit = mounted(*TRANSFORMS, *TRANSFORMS, TRANSFORMS[0].inverse())
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
         assert log.resolution.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
 
 
 def test_cameras_at_the_same_place_are_named(tmp_path):
-    def edit(topic, number, message):
-        if topic.endswith("right/camera_info"):
-            message.p[3] = 0.0
-        right = replace(TRANSFORMS[0], child="right_optical")
-        return transform_message([(each, START) for each in (*TRANSFORMS, right)]) if topic == "/tf_static" else message
-
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
+    single = changed("right/camera_info", {"p": model().p.ravel()})
+    edit = mounted(*TRANSFORMS, replace(TRANSFORMS[0], child="right_optical"))
+    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, single)) as log:
         assert log.missing["left"].startswith("the baseline is 0 m: P[0,3] of the right CameraInfo is 0, and 'left")

@@ -10,12 +10,14 @@ from recordings import McapSource
 from tests.conftest import rewrite
 from tests.recordings.sample_log import (
     FRAMES,
+    INFOS,
     LAYOUTS,
     LEFT,
     PERIOD,
     START,
     TILT,
     changed,
+    dropped,
     inventory_of,
     items_of,
     write_sample,
@@ -27,12 +29,7 @@ IMAGE_LAG = 1000  # ns between an image's stamp and its log time in the sample
 
 @pytest.mark.parametrize("lag", [0, 50_000_000])
 def test_an_image_under_another_calibration_is_lost(tmp_path, lag):
-    def edit(topic, number, message):
-        if topic == INFO and number in (2, 3):
-            message.k = message.k * 1.5
-        return message
-
-    plain = write_sample(tmp_path / "plain.mcap", edit)
+    plain = write_sample(tmp_path / "plain.mcap", changed(INFO, {"k": lambda k: k * 1.5}, [2, 3]))
     # The calibration is logged after its image.
     late = lambda topic, time: time + (lag if topic == INFO else 0)  # noqa: E731
     path = rewrite(plain, tmp_path / "log.mcap", time=late)
@@ -51,14 +48,10 @@ def test_an_image_under_another_calibration_is_lost(tmp_path, lag):
 def calibrated_once_more(path: Path, layout: str, again: Any = 2) -> Path:
     """A log of half a hertz whose CameraInfo come with frame 0, and changed with frame 2 (and `again`)."""
 
-    def edit(topic: str, number: int, message: Any) -> Any:
-        if topic.endswith("camera_info"):
-            message.k = message.k * (1.5 if number else 1)
-            return message if number in (0, 2, again) else None
-        return message
-
+    later = changed("camera_info", {"k": lambda k: k * 1.5}, range(1, FRAMES))
+    rare = dropped(*INFOS, numbers={*range(FRAMES)} - {0, 2, again})
     slow = lambda topic, time: START + 20 * (time - START)  # noqa: E731
-    plain = write_sample(path.with_name("plain.mcap"), edit)
+    plain = write_sample(path.with_name("plain.mcap"), later, rare)
     return rewrite(plain, path, time=slow, **LAYOUTS[layout])
 
 

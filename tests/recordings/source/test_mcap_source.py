@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +33,7 @@ from tests.recordings.sample_log import (
     items_of,
     model,
     picture,
+    replaced,
     tilt_quaternion,
     with_extra,
     write_sample,
@@ -81,11 +81,7 @@ def test_the_mount_comes_first_and_follows_the_static_transforms(whole):
 
 
 def test_the_mount_holds_after_a_clock_was_set_back(tmp_path):
-    def set_back(topic, number, message):
-        if number >= 3:
-            message.header.stamp.sec -= 3600
-        return message
-
+    set_back = changed("", {"header.stamp.sec": lambda seconds: seconds - 3600}, range(3, FRAMES))
     items = [item for _, _, item in items_of(write_sample(tmp_path / "log.mcap", set_back), start=0.25)]
     (mount,) = (item for item in items if isinstance(item, Mount))
     images = [item for item in items if isinstance(item, CameraImage)]
@@ -156,18 +152,11 @@ def test_pairs_are_found_by_common_camera_names(tmp_path, names):
 
 
 def test_a_bad_message_is_lost_alone(tmp_path):
-    def edit(topic, number, message):
-        if topic == LEFT and number == 1:
-            message.data = message.data[:-5]
-        if topic == RIGHT and number == 2:
-            message.encoding = "packed10"
-        if topic == TILT and number == 3:
-            message.orientation.x = 5.0
-        if topic == "/odom" and number == 2:
-            message.header.stamp.nanosec = 2**32 - 1
-        return message
-
-    events = items_of(write_sample(tmp_path / "log.mcap", edit))
+    edits = (
+        changed(LEFT, {"data": lambda data: data[:-5]}, [1]), changed(RIGHT, {"encoding": "packed10"}, [2]),
+        changed(TILT, {"orientation.x": 5.0}, [3]), changed("/odom", {"header.stamp.nanosec": 2**32 - 1}, [2]),
+    )  # fmt: skip
+    events = items_of(write_sample(tmp_path / "log.mcap", *edits))
     problems = {stream: str(item) for _, stream, item in events if isinstance(item, Exception)}
     assert f"the image is cut: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in problems["left"]
     assert "image encoding 'packed10' is not supported" in problems["right"]
@@ -188,11 +177,7 @@ def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path):
 
 @pytest.mark.parametrize("whole", [None, FRAMES // 2])
 def test_a_camera_with_only_broken_images_is_missing(tmp_path, whole, monkeypatch):
-    def edit(topic, number, message):
-        if topic == RIGHT and number != whole:
-            message.data = message.data[:-5]
-        return message
-
+    edit = changed(RIGHT, {"data": lambda data: data[:-5]}, {*range(FRAMES)} - {whole})
     monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert list(log.missing) == (["right"] if whole is None else [])
@@ -200,22 +185,16 @@ def test_a_camera_with_only_broken_images_is_missing(tmp_path, whole, monkeypatc
             assert log.missing["right"].startswith(f"{RIGHT}: the image is cut: ")
 
 
-def gray(message: Any) -> Any:
-    message.encoding, message.step, message.data = "mono8", WIDTH, message.data[: WIDTH * HEIGHT]
-    return message
-
-
-def cropped(message: Any) -> Any:
-    message.height, message.data = HEIGHT - 2, message.data[: 3 * WIDTH * (HEIGHT - 2)]
-    return message
+GRAY = {"encoding": "mono8", "step": WIDTH, "data": lambda data: data[: WIDTH * HEIGHT]}
+CROPPED = {"height": HEIGHT - 2, "data": lambda data: data[: 3 * WIDTH * (HEIGHT - 2)]}
 
 
 @pytest.mark.parametrize("odd", [range(FRAMES), range(1), range(FRAMES - 1, FRAMES), range(1, FRAMES - 1)])
 @pytest.mark.parametrize(
-    ("topic", "change", "problems"),
+    ("topic", "values", "problems"),
     [
         (
-            RIGHT, gray,
+            RIGHT, GRAY,
             dict.fromkeys(
                 ("left", "right"),
                 f"the images on {LEFT} are 24x16 colour of 8 bit, those on {RIGHT} are 24x16 gray of 8 bit; "
@@ -223,7 +202,7 @@ def cropped(message: Any) -> Any:
             ),
         ),
         (
-            LEFT, cropped,
+            LEFT, CROPPED,
             {
                 "left": f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning "
                 "and region of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
@@ -231,22 +210,18 @@ def cropped(message: Any) -> Any:
         ),
     ],
 )  # fmt: skip
-def test_mismatched_images_are_reported_unless_some_match(tmp_path, topic, change, problems, odd):
-    edit = lambda name, number, message: change(message) if name == topic and number in odd else message  # noqa: E731
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert log.missing == (problems if len(odd) == FRAMES else {})
+def test_mismatched_images_are_reported_unless_some_match(tmp_path, topic, values, problems, odd):
+    path = write_sample(tmp_path / "log.mcap", changed(topic, values, odd))
+    assert missing(path) == (problems if len(odd) == FRAMES else {})
 
 
 # Plain angles
 
 
 def bare(tmp_path: Path, x: float, y: float) -> Path:
-    def edit(topic: str, number: int, message: Any) -> Any:
-        vector = make("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0)
-        stamped = message.header if topic == TILT else None
-        return make("geometry_msgs/msg/Vector3Stamped", header=stamped, vector=vector) if topic == TILT else message
-
-    return write_sample(tmp_path / "bare.mcap", edit)
+    vector = make("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0)
+    angles = lambda message: make("geometry_msgs/msg/Vector3Stamped", header=message.header, vector=vector)  # noqa: E731
+    return write_sample(tmp_path / "bare.mcap", replaced(TILT, angles))
 
 
 PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tests.conftest import SMALL, edit_of, rewrite, roverflow
-from tests.recordings.sample_log import LEFT, PERIOD, RIGHT, START, essences, items_of, write_sample
+from tests.conftest import SMALL, rewrite, roverflow
+from tests.recordings.sample_log import FRAMES, LEFT, PERIOD, RIGHT, START, changed, essences, items_of, write_sample
 
 APART = 4_000_000  # ns between the stamps of the images of a frame
 
@@ -15,11 +15,7 @@ def stamps(events, stream):
 @pytest.mark.parametrize("after", [-APART, APART])
 @pytest.mark.parametrize("bounds", [{"end": 0.202}, {"end": 0.198}, {"start": 0.202}, {"start": 0.198}])
 def test_an_edge_between_the_stamps_of_a_pair_cuts_no_frame_in_two(tmp_path, after, bounds):
-    def edit(topic, number, message):
-        if topic == RIGHT:
-            message.header.stamp.nanosec += after if number else 0
-        return message
-
+    edit = changed(RIGHT, {"header.stamp.nanosec": lambda time: time + after}, range(1, FRAMES))
     events = items_of(write_sample(tmp_path / "log.mcap", edit), **bounds)
     left, right = (stamps(events, side) for side in ("left", "right"))
     assert len(left) == len(right) in (2, 3)
@@ -58,11 +54,6 @@ def test_messages_recorded_twice_are_read_once(sample, whole, tmp_path, later):
     assert essences(events) == essences(whole)
 
 
-def test_another_image_with_the_same_stamp_is_no_repetition(sample, tmp_path):
-    def edit(index, message):
-        if index == 1:
-            message.header.stamp.nanosec = 0
-
-    kind = "sensor_msgs/msg/Image"
-    path = rewrite(sample, tmp_path / "log.mcap", edit_of(LEFT, kind, edit))
+def test_another_image_with_the_same_stamp_is_no_repetition(tmp_path):
+    path = write_sample(tmp_path / "log.mcap", changed(LEFT, {"header.stamp.nanosec": 0}, [1]))
     assert stamps(items_of(path), "left")[:3] == [START, START, START + 2 * PERIOD]
