@@ -152,13 +152,6 @@ def _as_bright(image: Array, model: Array) -> Array:
     return cv2.convertScaleAbs(image, alpha=scale, beta=float(other_mean) - scale * float(mean))
 
 
-def _corrected(offset: RowOffset, left: Array, right: Array, here: Array, there: Array) -> tuple[Array, ...]:
-    """The view with the offset removed from the right image and from its features."""
-    moved = there.copy()
-    moved[:, 1] += offset_at(offset.terms, *_centred(there[:, 0], here[:, 1], right.shape))
-    return left, moved_down(right, offset.terms), here, moved
-
-
 def _centred(x: Array, y: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Pixels as positions from the image's centre, in its width and height."""
     height, width = shape
@@ -184,8 +177,11 @@ def _near_the_most_common(here: Array, there: Array) -> tuple[Array, Array]:
 
 
 def _offsets_after(offset: RowOffset, view: tuple[Array, ...]) -> tuple[Array, Array]:
-    """The `_offsets` that remain after a correction."""
-    return _offsets(*_corrected(offset, *view))
+    """The `_offsets` that remain once the right image of a view and its features are moved down by an offset."""
+    left, right, here, there = view
+    moved = there.copy()
+    moved[:, 1] += offset_at(offset.terms, *_centred(there[:, 0], here[:, 1], right.shape))
+    return _offsets(left, moved_down(right, offset.terms), here, moved)
 
 
 def _offsets(left: Array, right: Array, here: Array, there: Array) -> tuple[Array, Array]:

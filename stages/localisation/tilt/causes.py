@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cache
 from itertools import permutations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -74,23 +74,19 @@ class Fit:
         turned = np.einsum("kij,kj->ki", self.evidence.cameras if cameras is None else cameras, ups)
         return np.asarray(self.operator @ turned)
 
-    def misfit(self, undo: Array) -> float:
-        """Squared residuals after `undo`, (3, 3), is applied to the inclinometer's vectors."""
-        return self.misfit_of(self.evidence.ups @ (self.evidence.mount @ undo).T)
-
-    def misfit_of(self, ups: Array, cameras: Array | None = None) -> float:
-        """The same for directions in the camera."""
+    def misfit(self, ups: Array, cameras: Array | None = None) -> float:
+        """Squared residuals of directions in the camera."""
         return float(np.sum(np.square(self.residuals(ups, cameras))))
 
-    def slope(self, undo: Array) -> float:
-        """Squared mean slope of the ground in view, over its variance."""
-        return self.slope_of(self.evidence.ups @ (self.evidence.mount @ undo).T)
-
-    def slope_of(self, ups: Array) -> float:
-        """The same for directions in the camera."""
+    def slope(self, ups: Array) -> float:
+        """Squared mean slope of the ground in view, over its variance, by directions in the camera."""
         if self.normal is None:
             return 0.0
         return float(np.sum(np.square(self.normal - ups[self.known].mean(axis=0)))) / GROUND_SIGMA**2
+
+    def cause(self, fault: str, remedy: str, ups: Array, parameters: int = 0, **more: Any) -> Cause:
+        """A fault without which up has the directions `ups` in the camera."""
+        return Cause(fault, remedy, self.misfit(ups), self.slope(ups), parameters, **more)
 
 
 def _operator(segments: Array, drift: Array, noise: float) -> Array:
@@ -108,11 +104,12 @@ def _operator(segments: Array, drift: Array, noise: float) -> Array:
 
 def exchanged_axes(fit: Fit) -> list[Cause]:
     """Flipped signs and exchanged axes; motion alone does not determine the sign of up."""
-    return [
-        Cause(fault, remedy, fit.misfit(undo), fit.slope(undo), 1, undone=fit.evidence.mount @ undo)
-        for fault, remedy, undo in _exchanges()
-        if undo[2, 2] > 0 or fit.normal is not None
-    ]
+    found = []
+    for fault, remedy, undo in _exchanges():
+        if undo[2, 2] > 0 or fit.normal is not None:
+            mount = fit.evidence.mount @ undo
+            found.append(fit.cause(fault, remedy, fit.evidence.ups @ mount.T, 1, undone=mount))
+    return found
 
 
 @cache
@@ -145,7 +142,7 @@ def radians_as_degrees(fit: Fit) -> Cause | None:
         return None
     ups = np.column_stack([level, np.sqrt(rest)]) @ fit.evidence.mount.T
     remedy = "Check the unit of source.pitch and source.roll (rad, not deg), or the inclinometer's driver."
-    return Cause("radians are taken for degrees", remedy, fit.misfit_of(ups), fit.slope_of(ups), 1)
+    return fit.cause("radians are taken for degrees", remedy, ups, 1)
 
 
 @cache
@@ -165,7 +162,7 @@ def wrong_mount(fit: Fit) -> Cause:
 
     mount = fit.evidence.mount
     starts = [mount @ turn @ mount.T for turn in _right_angles()]
-    cost = [fit.misfit_of(fit.ups @ s.T) + fit.slope_of(fit.ups @ s.T) for s in starts]
+    cost = [fit.misfit(fit.ups @ s.T) + fit.slope(fit.ups @ s.T) for s in starts]
     turn = starts[int(np.argmin(cost))] if min(cost) < 0.25 * cost[0] else np.eye(3)
     for _ in range(8):
         ups = fit.ups @ turn.T
@@ -189,9 +186,8 @@ def wrong_mount(fit: Fit) -> Cause:
         f"It is rotated by {degrees(angle)} about axis ({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}). Check "
         f"/tf_static, or set source.camera_from_inclinometer to [{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}]."
     )
-    return Cause(
-        fault, remedy, fit.misfit_of(ups), fit.slope_of(ups), 3, angle / MIN_ANGLE, sigma / MIN_ANGLE, turn @ mount
-    )  # fmt: skip
+    size, error = angle / MIN_ANGLE, sigma / MIN_ANGLE
+    return fit.cause(fault, remedy, ups, 3, size=size, error=error, undone=turn @ mount)
 
 
 def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
@@ -214,7 +210,7 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
             inside = within[kept] == stretch
             if inside.any():
                 cameras[inside] = spline(seconds[inside] - late).as_matrix()
-        return fit.misfit_of(fit.ups, cameras)
+        return fit.misfit(fit.ups, cameras)
 
     step = 0.05
     times = np.arange(-MAX_OFFSET, MAX_OFFSET + step / 2, step)

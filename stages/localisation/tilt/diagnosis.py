@@ -94,7 +94,7 @@ def diagnose(evidence: Evidence) -> Diagnosis:
 def _judged(evidence: Evidence, degrees_of_freedom: int, noise: float) -> tuple[Diagnosis, float]:
     """The diagnosis for tilts with an assumed noise, rad; and the noise that results from it."""
     fit = Fit(evidence, noise)
-    sound = Cause("", "", fit.misfit(np.eye(3)), fit.slope(np.eye(3)))
+    sound = fit.cause("", "", fit.ups)
     tried = _Hypotheses(
         len(evidence.stamps), degrees_of_freedom, noise, sound, exchanged_axes(fit), wrong_mount(fit),
         late_stamps(fit, sound), radians_as_degrees(fit),

@@ -34,6 +34,10 @@ def model_with(name, turn, projection):
     return CameraModel(WIDTH, HEIGHT, K, np.array(DISTORTIONS[name]), rotation, projection, name)
 
 
+def camera_of(*models, rectified=False):
+    return StereoCamera.from_models(*models, "cam", rectified)
+
+
 def raw_image(model, rows_up=0.0):
     """What the camera sees of the scene: every raw pixel undistorted by OpenCV's iterative solver, then looked up."""
     pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=2).reshape(-1, 1, 2).astype(np.float64)
@@ -45,8 +49,7 @@ def raw_image(model, rows_up=0.0):
 @pytest.mark.parametrize("name", DISTORTIONS)
 def test_a_distorted_scene_comes_back_straight(name):
     models = model_with(name, [0.01, -0.02, 0.015], P_LEFT), model_with(name, [-0.01, 0.02, -0.01], P_RIGHT)
-    camera = StereoCamera.from_models(*models, "cam", rectified=False)
-    rectified = Rectify()(StereoFrame(7, raw_image(models[0]), raw_image(models[1]), camera))
+    rectified = Rectify()(StereoFrame(7, *map(raw_image, models), camera_of(*models)))
     inside = np.s_[40:-40, 50:-50]
     expected = scene(*np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)))
     assert np.abs(rectified.left - expected)[inside].max() < 2.5
@@ -60,7 +63,7 @@ def test_a_distorted_scene_comes_back_straight(name):
 def test_the_row_offset_moves_the_right_image_down(rectified, dtype):
     left = CameraModel(WIDTH, HEIGHT, P_LEFT[:, :3], np.zeros(5), np.eye(3), P_LEFT)
     right = CameraModel(WIDTH, HEIGHT, P_LEFT[:, :3], np.zeros(5), np.eye(3), P_RIGHT)
-    camera = StereoCamera.from_models(left, right, "cam", rectified)
+    camera = camera_of(left, right, rectified=rectified)
     expected = scene(*np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)))
     frame = StereoFrame(1, np.round(expected).astype(dtype), raw_image(right, rows_up=0.6).astype(dtype), camera)
     moved = Rectify(row_offset=0.6)(frame)
@@ -84,28 +87,26 @@ def test_maps_are_made_once_for_equal_calibrations():
     for _ in range(2):
         models = model_with("plumb_bob", [0.03, 0, 0], P_LEFT), model_with("plumb_bob", [0, 0.03, 0], P_RIGHT)
         image = np.zeros((HEIGHT, WIDTH), np.uint8)
-        frames.append(StereoFrame(1, image, image, StereoCamera.from_models(*models, "cam", rectified=False)))
+        frames.append(StereoFrame(1, image, image, camera_of(*models)))
     before = _rectifying_maps.cache_info().misses
     for frame in frames:
         Rectify(row_offset=0)(frame)
     assert _rectifying_maps.cache_info().misses - before == 2
 
 
-@pytest.mark.parametrize(
-    ("model", "count", "message"),
-    [
-        ("pinhole", 5, "unknown distortion model 'pinhole'"),
-        ("equidistant", 5, "has 4 distortion"),
-        ("plumb_bob", 6, "has 0 or 4 or 5 or 8 or 12 or 14"),
-    ],
-)
-def test_a_calibration_that_cannot_be_used_is_named(model, count, message):
-    bad = CameraModel(WIDTH, HEIGHT, K, np.zeros(count), np.eye(3), P_RIGHT, model)
+@pytest.mark.parametrize(("entry", "message"), [
+    ({"model": "pinhole"}, "unknown distortion model 'pinhole'"),
+    ({"model": "equidistant"}, "has 4 distortion"),
+    ({"d": np.zeros(6)}, "has 0 or 4 or 5 or 8 or 12 or 14"),
+    ({"k": np.zeros((3, 3))}, "no focal length in K"),
+    ({"r": np.zeros((3, 3))}, "R of the calibration is not a rotation"),
+    ({"r": np.diag([1.0, 1, 0.5])}, "R of the calibration is not a rotation"),
+])  # fmt: skip
+def test_a_calibration_that_cannot_be_used_is_named(entry, message):
+    left, right = (CameraModel(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), p) for p in (P_LEFT, P_RIGHT))
     image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    left = CameraModel(WIDTH, HEIGHT, K, np.zeros(count), np.eye(3), P_LEFT, model)
-    camera = StereoCamera.from_models(left, bad, "cam", rectified=False)
     with pytest.raises(ValueError, match=message):
-        Rectify()(StereoFrame(1, image, image, camera))
+        Rectify()(StereoFrame(1, image, image, camera_of(left, replace(right, **entry))))
 
 
 @pytest.mark.parametrize(("place", "name"), [((0, 0), "fx"), ((1, 1), "fy"), ((1, 2), "cy")])
@@ -114,7 +115,7 @@ def test_projections_of_no_rectified_pair_make_no_camera(place, name):
     other = P_RIGHT.copy()
     other[place] *= 1.05
     with pytest.raises(ValueError, match=f"not those of a rectified pair: {name} is"):
-        StereoCamera.from_models(left, replace(right, p=other), "cam", rectified=False)
+        camera_of(left, replace(right, p=other))
 
 
 def a_pair(terms=(), seed=0, size=SIZE):
@@ -130,6 +131,14 @@ def a_pair(terms=(), seed=0, size=SIZE):
 
 TURNED = (0.8, -0.3, 0.6, 0.9, -1.1)
 LARGE = (640, 480)
+CAMERA = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
+
+
+def large_models(cx_right=320.0):
+    k = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+    projections = np.c_[k, [0, 0, 0]], np.c_[k, [-100.0, 0, 0]]
+    projections[1][0, 2] = cx_right
+    return [CameraModel(*LARGE, k, np.zeros(5), np.eye(3), projection) for projection in projections]
 
 
 @pytest.mark.parametrize("terms", [(1.3,), (-0.7, 0.5, 0.8), TURNED])
@@ -172,11 +181,13 @@ def test_aligned_images_with_little_texture_are_left_alone(pairs):
     assert corrected <= pairs // 20
 
 
-def test_repeated_views_do_not_reduce_the_stated_error():
+def test_features_in_a_corner_give_an_honest_error_that_repeated_views_do_not_reduce():
     left, right = (image.copy() for image in a_pair((1.0,), size=LARGE))
     for image in (left, right):
         image[150:], image[:, 200:] = 90, 90
     once, often = measure([(left, right)]), measure([(left, right)] * 9)
+    assert len(once.terms) < 5
+    assert np.abs(offset_field(once.terms, *LARGE) - 1.0).max() < 2 * once.error
     assert often.error == pytest.approx(once.error, rel=0.1)
     assert len(often.terms) == len(once.terms)
 
@@ -210,21 +221,9 @@ def test_without_evidence_there_is_no_offset(pair):
     assert (stage.row_offset, "not clear" in found.sentence, found.severity) == (0.0, True, "note")
 
 
-def test_features_in_a_corner_give_an_honest_error_of_the_whole_field():
-    left, right = (image.copy() for image in a_pair((1.0,), size=LARGE))
-    for image in (left, right):
-        image[150:], image[:, 200:] = 90, 90
-    measured = measure([(left, right)])
-    assert len(measured.terms) < 5
-    assert np.abs(offset_field(measured.terms, *LARGE) - 1.0).max() < 2 * measured.error
-
-
 @pytest.mark.parametrize("rectified", [True, False])
 def test_a_survey_measures_what_its_frames_have_in_common(rectified):
-    k = np.array([[500.0, 0, 319.5], [0, 500.0, 239.5], [0, 0, 1]])
-    p_left, p_right = np.c_[k, [0, 0, 0]], np.c_[k, [-100.0, 0, 0]]
-    models = (CameraModel(*LARGE, k, np.zeros(5), np.eye(3), p) for p in (p_left, p_right))
-    camera = StereoCamera.from_models(*models, "cam", rectified)
+    camera = camera_of(*large_models(), rectified=rectified)
     frames = [StereoFrame(stamp, *a_pair(TURNED, stamp, LARGE), camera) for stamp in range(3)]
     stage, found = Rectify().survey(frames)
     assert np.abs(offset_field(stage.row_offset, *LARGE) - offset_field(TURNED, *LARGE)).max() < 0.1
@@ -246,7 +245,7 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
 def test_a_survey_finds_swapped_and_unrectified_images(rows, swapped, words):
     left, right = a_pair((rows,), size=LARGE)
     pair = (right, left) if swapped else (left, right)
-    _, found = Rectify().survey([StereoFrame(1, *pair, StereoCamera(500, 500, 320, 240, 0.1, *LARGE))])
+    _, found = Rectify().survey([StereoFrame(1, *pair, CAMERA)])
     assert words in found.sentence
     assert ("swapped" in found.sentence, "at the centre" in found.sentence) == (swapped, not swapped)
     assert (found.severity, found.about) == (("fault", "cameras") if swapped else ("warning", ""))
@@ -254,8 +253,7 @@ def test_a_survey_finds_swapped_and_unrectified_images(rows, swapped, words):
 
 def test_a_principal_point_offset_is_not_reported_as_swapped_images():
     left, right = a_pair((0.0,), size=LARGE)
-    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE, cx_right=380)
-    _, found = Rectify().survey([StereoFrame(1, right, left, camera)])
+    _, found = Rectify().survey([StereoFrame(1, right, left, replace(CAMERA, cx_right=380))])
     assert "swapped" not in found.sentence
 
 
@@ -263,14 +261,13 @@ def test_a_principal_point_offset_is_not_reported_as_swapped_images():
 def test_a_pair_with_negative_disparities_is_shifted_above_zero(row_offset):
     left, right = a_pair((0.0,), size=LARGE)
     moved = np.roll(right, 60, axis=1)
-    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
-    shifted = StereoFrame(1, left, moved, replace(camera, cx_right=380.0))
+    shifted = StereoFrame(1, left, moved, replace(CAMERA, cx_right=380.0))
     alone = Rectify(row_offset=row_offset)(shifted)
     stage, found = Rectify(row_offset=row_offset).survey([shifted])
     assert (stage.columns, found.severity) == (60, "note")
     assert "the right image is moved to the left by 60 px" in found.sentence
     for frame in (alone, stage(shifted)):
-        assert frame.camera.cx_right == frame.camera.cx == camera.cx
+        assert frame.camera.cx_right == frame.camera.cx == CAMERA.cx
         assert np.array_equal(frame.right[:, :-60], right[:, :-60])
         assert not frame.right[:, -60:].any()
     # Near scenes may be taken by such a camera as well, and lose nothing.
@@ -284,10 +281,9 @@ def test_a_pair_with_negative_disparities_is_shifted_above_zero(row_offset):
     ({"baseline": 12.0}, "the baseline is 12 m: check that it is given in metres; "),
 ])  # fmt: skip
 def test_an_implausible_calibration_is_a_warning(changes, words):
-    camera = StereoCamera(500, 500, 320, 240, 0.1, *LARGE)
-    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), camera)
+    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), CAMERA)
     plain, sound = Rectify().survey([frame])
-    stage, found = Rectify().survey([replace(frame, camera=replace(camera, **changes))])
+    stage, found = Rectify().survey([replace(frame, camera=replace(CAMERA, **changes))])
     assert found.sentence.startswith(words)
     assert (sound.severity, found.severity) == ("note", "warning")
     assert stage == plain
@@ -295,39 +291,20 @@ def test_an_implausible_calibration_is_a_warning(changes, words):
 
 def test_shifted_columns_of_a_raw_image_keep_all_its_pixels():
     image = np.random.default_rng(0).integers(0, 256, (LARGE[1], LARGE[0], 3), np.uint8)
-    k = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
-    p_left, p_right = np.c_[k, [0, 0, 0]], np.c_[k, [-100.0, 0, 0]]
-    p_right[0, 2] = 380.0  # the rectified image begins 60 columns before the raw one
-    models = (CameraModel(*LARGE, k, np.zeros(5), np.eye(3), p) for p in (p_left, p_right))
-    raw = StereoFrame(1, image, image, StereoCamera.from_models(*models, "cam", rectified=False))
+    # The rectified image begins 60 columns before the raw one.
+    raw = StereoFrame(1, image, image, camera_of(*large_models(cx_right=380.0)))
     moved = Rectify(row_offset=0.0, columns=60)(raw)
     assert moved.camera.cx_right == 320
     assert np.array_equal(moved.right, image)
 
 
 def test_frames_that_cannot_be_rectified_are_no_part_of_the_survey():
-    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), StereoCamera(500, 500, 320, 240, 0.1, *LARGE))
+    frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), CAMERA)
     bad = CameraModel(*LARGE, K, np.zeros(5), np.eye(3), P_LEFT, "pinhole")
     broken = StereoFrame(2, frame.left, frame.right, replace(frame.camera, raw=(bad, bad)))
     stage, found = Rectify().survey([broken, frame])
     assert stage.row_offset[0] == pytest.approx(1.0, abs=0.1)
     assert "of 1 frame)" in found.sentence
-
-
-@pytest.mark.parametrize(
-    ("entry", "message"),
-    [
-        ({"k": np.zeros((3, 3))}, "no focal length in K"),
-        ({"r": np.zeros((3, 3))}, "R of the calibration is not a rotation"),
-        ({"r": np.diag([1.0, 1, 0.5])}, "R of the calibration is not a rotation"),
-    ],
-)
-def test_an_empty_calibration_makes_no_black_image(entry, message):
-    models = [CameraModel(WIDTH, HEIGHT, K, np.zeros(5), np.eye(3), projection) for projection in (P_LEFT, P_RIGHT)]
-    camera = StereoCamera.from_models(models[0], replace(models[1], **entry), "cam", rectified=False)
-    image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    with pytest.raises(ValueError, match=message):
-        Rectify()(StereoFrame(1, image, image, camera))
 
 
 def test_the_terms_that_a_survey_prints_are_a_valid_setting():
@@ -366,7 +343,7 @@ def polar_camera(folder, size):
     turn, shift = read("extrinsics", "rotation_matrix", "translation_vector")
     r1, r2, p1, p2 = cv2.stereoRectify(k1, d1, k2, d2, size, turn, shift, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)[:4]
     models = CameraModel(*size, k1, d1.ravel(), r1, p1), CameraModel(*size, k2, d2.ravel(), r2, p2)
-    return StereoCamera.from_models(*models, "cam", rectified=False)
+    return camera_of(*models)
 
 
 def row_offset(frame):
