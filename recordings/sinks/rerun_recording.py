@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
 PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
-BATCH_BYTES = 4 << 20  # of some frames; each stored chunk takes 3 kB besides its content
+BATCH_BYTES = 1 << 19  # that one entity waits with; each stored chunk takes 3 kB besides its content
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
