@@ -60,12 +60,11 @@ def test_a_merged_cell_is_the_inverse_variance_mean_of_its_logs(tmp_path):
     assert pgm[9, [10, 45, 46, 150]].tolist() == [0, 0, 254, 205]  # hazard, hazard, free, unknown
 
 
-def test_logs_that_differ_by_more_than_their_sigmas_are_reported(tmp_path, capsys):
+def test_logs_that_differ_by_more_than_their_sigmas_are_reported(tmp_path, said):
     a = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, hazard_col=-1)
     b = traverse(tmp_path / "b.mcap", 40, 1.2, 1e-4, hazard_col=-1)
-    assert roverflow("export", a, b, tmp_path / "out", "--merge") == 3
-    said = capsys.readouterr().out
-    assert "WARNING: a.mcap and b.mcap conflict in 1000 of 1000 common cells: the second is higher by +0.200 m" in said
+    text = said(3, "export", a, b, tmp_path / "out", "--merge").out
+    assert "WARNING: a.mcap and b.mcap conflict in 1000 of 1000 common cells: the second is higher by +0.200 m" in text
     (pair,) = json.loads((tmp_path / "out/merge.json").read_text())["overlaps"]
     assert (pair["logs"], pair["common_cells"], pair["conflicts"]) == ([1, 2], 1000, 1000)
     assert pair["mean_difference_m"] == pytest.approx(0.2, abs=1e-5)
@@ -75,15 +74,13 @@ def test_logs_that_differ_by_more_than_their_sigmas_are_reported(tmp_path, capsy
     assert np.asarray(Image.open(tmp_path / "out/navigation_map.pgm"))[9, 50] == 205  # no longer free
 
 
-def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, capsys):
+def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, refused):
     a = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, hazard_col=-1)
     other = traverse(tmp_path / "other.mcap", 0, 1.0, 4e-4, hazard_col=-1, frame="odom")
     with pytest.raises(LogError, match=r"other\.mcap has its map in 'odom' with cells of 0\.1 m, .*a\.mcap in 'map'"):
         merge([a, other], tmp_path / "out")
-    assert roverflow("export", a, other, tmp_path / "out") == 2
-    assert "add --merge to merge the maps of several logs" in capsys.readouterr().err
-    assert roverflow("export", tmp_path, tmp_path / "out", "--merge") == 2
-    assert "has no catalogue.sqlite" in capsys.readouterr().err
+    assert "add --merge to merge the maps of several logs" in refused("export", a, other, tmp_path / "out")
+    assert "has no catalogue.sqlite" in refused("export", tmp_path, tmp_path / "out", "--merge")
 
 
 @pytest.mark.slow

@@ -26,7 +26,7 @@ def test_evo_reads_the_poses_of_a_result(result, tmp_path):
     np.testing.assert_allclose(trajectory.orientations_quat_wxyz, turns, atol=1e-6)
 
 
-def test_evo_agrees_with_score_on_the_pose_error(traverse, tmp_path, capsys):
+def test_evo_agrees_with_score_on_the_pose_error(traverse, tmp_path):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
     assert roverflow("score", out, "--json", tmp_path / "score.json") == 0

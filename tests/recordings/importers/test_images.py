@@ -218,16 +218,15 @@ def test_images_are_read_as_the_log_is_written(tmp_path, monkeypatch):
     assert so_far == [2, 4, 6]
 
 
-def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, capsys):
+def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, said):
     left, right = make_pairs(tmp_path / "pairs", 4)
     (tmp_path / "camera.yaml").write_text(yaml.safe_dump(CALIBRATION))
     right[1].write_bytes(right[1].read_bytes()[:-100])
     save(left[2], picture(0)[:8])
     given = "--calibration", tmp_path / "camera.yaml", "--pitch-down", 15, "--height", 0.9
-    assert roverflow("import", "images", tmp_path / "pairs", tmp_path / "out.mcap", *given) == 0
-    said = capsys.readouterr().out
-    assert f"2 pairs left out, first: {right[1]} is cut after" in said
-    assert "2 stereo frames" in said
+    text = said(0, "import", "images", tmp_path / "pairs", tmp_path / "out.mcap", *given).out
+    assert f"2 pairs left out, first: {right[1]} is cut after" in text
+    assert "2 stereo frames" in text
     read = [item.stamp for _, stream, item in events(tmp_path / "out.mcap") if stream == "left"]
     assert np.diff(read).tolist() == [3_000_000_000]
 

@@ -104,25 +104,22 @@ def write_sequence(simulation, home, keys=True):
 
 
 @pytest.mark.parametrize("cameras", [("00", "01"), ("02", "03")], ids=["gray", "colour"])
-def test_a_drive_is_the_simulators_log(tmp_path, capsys, cameras):
+def test_a_drive_is_the_simulators_log(tmp_path, said, refused, cameras):
     simulation = gray(EXACT) if cameras[0] == "00" else EXACT
     folder, own = write_drive(simulation, tmp_path, cameras), own_log(simulation, tmp_path / "own.mcap")
     log, option = tmp_path / "log.mcap", ["--color"] if cameras[0] == "02" else []
-    assert roverflow("import", "kitti", folder, log, *option) == 0
-    said = capsys.readouterr().out
-    assert "timestamps.txt lists 1 pair without one of the images" in said
-    assert "base_link is 0.93 m below the Imu" in said
+    text = said(0, "import", "kitti", folder, log, *option).out
+    assert "timestamps.txt lists 1 pair without one of the images" in text
+    assert "base_link is 0.93 m below the Imu" in text
     assert_same(log, own)
     assert_same_truth(log, own, 1e-6)
     _, _, place = next(iter_decoded(log, ["/gps/fix"]))
     assert place.latitude == pytest.approx(49, abs=1e-9)
     assert place.header.frame_id == "imu_link"
     (folder / "oxts" / "data" / "0000000001.txt").write_text("49 8 \n")
-    assert roverflow("import", "kitti", folder, log, *option) == 2
-    assert "fewer than 6 numbers" in capsys.readouterr().err
+    assert "fewer than 6 numbers" in refused("import", "kitti", folder, log, *option)
     (tmp_path / CALIBRATIONS[0]).write_text("")
-    assert roverflow("import", "kitti", folder, log, *option) == 2
-    assert f"lacks 'S_rect_{cameras[0]}' with 2 numbers" in capsys.readouterr().err
+    assert f"lacks 'S_rect_{cameras[0]}' with 2 numbers" in refused("import", "kitti", folder, log, *option)
 
 
 def test_a_drive_before_rectification_is_the_simulators_log(tmp_path):
@@ -150,30 +147,26 @@ def test_kittis_own_calibration_has_its_baselines_and_the_cameras_height():
 
 
 @pytest.mark.parametrize("keys", [True, False], ids=["with keys", "without keys"])
-def test_an_odometry_sequence_is_the_simulators_log(tmp_path, capsys, keys):
+def test_an_odometry_sequence_is_the_simulators_log(tmp_path, said, refused, keys):
     simulation = gray(replace(EXACT, slope=0.0))  # the rover stands level, as the rig file says
     (folder, rig), own = write_sequence(simulation, tmp_path, keys), own_log(simulation, tmp_path / "own.mcap")
     log = tmp_path / "log.mcap"
-    assert roverflow("import", "kitti", folder, log, "--rig", rig) == 0
-    assert "turned by the true poses in 05.txt" in capsys.readouterr().out
+    assert "turned by the true poses in 05.txt" in said(0, "import", "kitti", folder, log, "--rig", rig).out
     assert_same(log, own, stamps=False, tolerance=1e-7)
     (tmp_path / "poses" / "05.txt").unlink()
-    assert roverflow("import", "kitti", folder, log, "--rig", rig) == 0
-    assert "the car is taken as level" in capsys.readouterr().out
+    assert "the car is taken as level" in said(0, "import", "kitti", folder, log, "--rig", rig).out
     assert_same(log, own, stamps=False, tolerance=1e-7)
-    assert roverflow("import", "kitti", folder, log) == 2
-    said = capsys.readouterr().err
-    assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in said
+    text = refused("import", "kitti", folder, log)
+    assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in text
 
 
-def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, capsys):
+def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, said):
     folder, rig = write_sequence(gray(EXACT), tmp_path)
     (folder / "times.txt").write_text("0.0\n0.1\n0.1\n")
-    assert roverflow("import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig) == 0
-    said = capsys.readouterr().out
-    assert "1 pair left out, first:" in said
-    assert "000002.png has the same time as the image before it, 1100000000 ns" in said
-    assert "2 stereo frames" in said
+    text = said(0, "import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig).out
+    assert "1 pair left out, first:" in text
+    assert "000002.png has the same time as the image before it, 1100000000 ns" in text
+    assert "2 stereo frames" in text
 
 
 def test_the_poses_of_a_sequence_tilt_its_frames(tmp_path):

@@ -66,11 +66,11 @@ def write_lusnar(simulation, folder):
 
 
 @pytest.mark.parametrize("cameras", [("lcam_front", "rcam_front"), ("left", "right")], ids=["second", "first"])
-def test_a_trajectory_of_tartanair_is_the_simulators_log(tmp_path, capsys, cameras):
+def test_a_trajectory_of_tartanair_is_the_simulators_log(tmp_path, said, cameras):
     folder, own = write_tartanair(EXACT, tmp_path / "P000", cameras), own_log(EXACT, tmp_path / "own.mcap")
     log = tmp_path / "log.mcap"
-    assert roverflow("import", "tartanair", folder, log, "--rig", folder / "rig.yaml") == 0
-    assert f"1 image of image_{cameras[0]} without a partner" in capsys.readouterr().out
+    text = said(0, "import", "tartanair", folder, log, "--rig", folder / "rig.yaml").out
+    assert f"1 image of image_{cameras[0]} without a partner" in text
     assert_same(log, own, stamps=False)
     assert_same_truth(log, own)
     assert list(true_poses(log)) == [1_000_000_000 + number * 100_000_000 for number in range(3)]
@@ -80,13 +80,12 @@ def test_a_trajectory_of_tartanair_is_the_simulators_log(tmp_path, capsys, camer
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
-def test_the_camera_of_tartanair_looks_90_degrees_wide(tmp_path, capsys):
+def test_the_camera_of_tartanair_looks_90_degrees_wide(tmp_path, refused):
     folder = write_tartanair(EXACT, tmp_path / "P000")
     assert roverflow("import", "tartanair", folder, tmp_path / "log.mcap") == 0
     _, _, info = next(iter_decoded(tmp_path / "log.mcap", ["/stereo/right/camera_info"]))
     np.testing.assert_allclose(info.p.reshape(3, 4)[:2], [[80, 0, 80, -80 * 0.25], [0, 80, 60, 0]])
-    assert roverflow("import", "tartanair", tmp_path, tmp_path / "log.mcap") == 2
-    assert "give the folder of one trajectory" in capsys.readouterr().err
+    assert "give the folder of one trajectory" in refused("import", "tartanair", tmp_path, tmp_path / "log.mcap")
 
 
 def test_a_scene_of_lusnar_is_the_simulators_log(tmp_path):
@@ -108,10 +107,8 @@ def test_a_scene_of_lusnar_is_the_simulators_log(tmp_path):
     ],
     ids=range(7),
 )
-def test_a_rig_file_that_says_too_little_is_refused(tmp_path, capsys, rig, words):
+def test_a_rig_file_that_says_too_little_is_refused(tmp_path, refused, rig, words):
     folder = write_lusnar(replace(EXACT, frames=1), tmp_path / "Moon_1")
     (tmp_path / "rig.yaml").write_text(rig)
-    assert roverflow("import", "lusnar", folder, tmp_path / "log.mcap", "--rig", tmp_path / "rig.yaml") == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    given = "import", "lusnar", folder, tmp_path / "log.mcap", "--rig", tmp_path / "rig.yaml"
+    assert words in refused(*given)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from flow.cli.commands.simulate import OPTIONS
-from flow.cli.main import main
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.simulator import Simulation, camera, write_log
@@ -164,11 +163,11 @@ def test_a_set_parameter_wins_over_its_scene(scene):
     assert (bare.dust, bare.bedrock) == (0.0, 0.0)
 
 
-def test_an_unknown_scene_or_too_much_ground_is_refused(tmp_path, capsys):
-    assert main(["simulate", str(tmp_path / "log.mcap"), "--scene", "sea"]) == 2
-    assert f"--scene must be one of {', '.join(SCENES)}, not sea" in capsys.readouterr().err
-    assert main(["simulate", str(tmp_path / "log.mcap"), "--sand", "80", "--bedrock", "30"]) == 2
-    assert "--sand must be at most 1 with dust and bedrock, not 1.1 together" in capsys.readouterr().err
+def test_an_unknown_scene_or_too_much_ground_is_refused(tmp_path, refused):
+    out = tmp_path / "log.mcap"
+    assert f"--scene must be one of {', '.join(SCENES)}, not sea" in refused("simulate", out, "--scene", "sea")
+    why = refused("simulate", out, "--sand", 80, "--bedrock", 30)
+    assert "--sand must be at most 1 with dust and bedrock, not 1.1 together" in why
 
 
 @pytest.mark.parametrize("option", OPTIONS)
