@@ -1,12 +1,18 @@
-"""Stages: `help()` shows the meaning of every parameter."""
+"""Stages: `help()` shows the meaning of every parameter, and inputs that do not belong together are refused."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import pytest
 
 import stages
 from flow.config.reference import stage_reference
+from stages import CameraModel, Disparity, StereoCamera, StereoFrame
 from stages.stage import Stage
+from tests.stages.running import Running
 
 NAMED = {name: getattr(stages, name) for name in stages.__all__}
 KINDS = {name: kind for name, kind in NAMED.items() if isinstance(kind, type) and issubclass(kind, Stage)}
@@ -19,3 +25,35 @@ def test_help_shows_the_meaning_of_every_parameter(name: str) -> None:
     assert text.count("\nParameters\n----------\n") == bool(found.parameters)
     for item in found.parameters:
         assert item.meaning in text or "." in item.name  # those of a value such as the rover stand in its own help
+
+
+IMAGE = np.zeros((60, 80), np.uint8)
+MODEL = CameraModel(80, 60, np.eye(3), np.zeros(5), np.eye(3), np.eye(3, 4))
+FRAME = StereoFrame(7, IMAGE, IMAGE, StereoCamera(200, 200, 40, 30, 0.2, 80, 60))
+RAW = replace(FRAME, camera=replace(FRAME.camera, raw=(MODEL, MODEL)))
+
+
+def disparity(height: int = 60, width: int = 80, stamp: int = 7) -> Disparity:
+    return Disparity(stamp, *(np.ones((height, width), kind) for kind in (np.float32, np.uint8, np.float32)))
+
+
+OF_BOTH = stages.Refine(), stages.RefinePaper(), stages.Reproject()
+JOIN = "join the disparity with the rectified frame"
+TIMES = "frame of 7 ns, disparity of 8 ns: join data"
+
+
+@pytest.mark.parametrize(("stage", "inputs", "message"), [
+    *((stage, (FRAME, disparity(30)), rf"{type(stage).__name__}: .* \(30, 80\), .*{JOIN}")
+      for stage in OF_BOTH),
+    *((stage, (RAW, disparity()), rf"put stages\.Rectify before stages\.{type(stage).__name__}")
+      for stage in OF_BOTH),
+    *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_BOTH[:2]),
+    (Running(stages.VisualOdometry()), (FRAME, disparity(30)), JOIN),
+    (stages.Upsample(), (FRAME, disparity(40, 66)), r"Upsample: .*\(40, 66\)"),
+    (stages.Upsample(), (FRAME, disparity(30, 40, stamp=8)), f"Upsample: {TIMES}"),
+    (stages.LeftRightCheck(), (disparity(), disparity(30)), "LeftRightCheck: .* at the same size"),
+    (stages.LeftRightCheck(), (disparity(), disparity(stamp=8)), "disparity of 7 ns, backward of 8 ns: join data"),
+])  # fmt: skip
+def test_inputs_that_do_not_belong_together_are_refused(stage: Any, inputs: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        stage(*inputs)

@@ -9,7 +9,7 @@ import pytest
 
 from stages.cloud.kernels.triangulation import DisparitySigma, triangulate, triangulate_reference
 from stages.cloud.reproject import Reproject
-from stages.data import CameraModel, Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.data import Disparity, PixelOrigin, StereoCamera, StereoFrame
 from tests.stages.terrain.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
 
 SMALL = StereoCamera(100.0, 110.0, 7.5, 5.25, 0.2, 16, 12, cx_right=9.0)
@@ -129,12 +129,6 @@ def test_the_camera_of_the_disparity_takes_precedence() -> None:
     assert Reproject()(blank_frame(SMALL), without).points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
 
 
-def test_wrong_sizes_unrectified_frames_and_wrong_sigmas_are_refused() -> None:
-    with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
-        Reproject()(blank_frame(), as_disparity(np.ones((12, 16)), SMALL))
-    model = CameraModel(16, 12, np.eye(3), np.zeros(5), np.eye(3), np.eye(3, 4))
-    raw = StereoCamera(100.0, 100.0, 8.0, 6.0, 0.2, 16, 12, raw=(model, model))
-    with pytest.raises(ValueError, match=r"put stages\.Rectify before"):
-        Reproject()(blank_frame(raw), as_disparity(np.ones((12, 16)), SMALL))
+def test_wrong_sigmas_are_refused() -> None:
     with pytest.raises(ValueError, match="sigma_worst must be at least"):
         Reproject(sigma_best=43.0)

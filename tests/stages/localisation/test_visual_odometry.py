@@ -171,11 +171,3 @@ def test_features_with_a_filled_disparity_do_not_count(drive):
     frame, disparity = drive[0][0]
     filled = replace(disparity, source=np.full_like(disparity.source, 3))
     assert Running(VisualOdometry())(frame, filled).lost == "only 0 features have a disparity (minimum 40)"
-
-
-def test_a_disparity_of_another_size_is_refused(drive):
-    frame, disparity = drive[0][0]
-    layers = disparity.pixels, disparity.source, disparity.confidence
-    half = Disparity(0, *(layer[::2, ::2].copy() for layer in layers))
-    with pytest.raises(ValueError, match="join the disparity with the rectified frame"):
-        Running(VisualOdometry())(frame, half)

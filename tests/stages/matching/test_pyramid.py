@@ -98,33 +98,12 @@ def test_what_the_right_image_sees_otherwise_is_unknown():
     assert np.isfinite(beyond.pixels).all()  # 5 px was not searched for from the right
 
 
-def test_sizes_that_do_not_fit_are_refused():
-    frame, _ = slope_frame()
-    small = np.zeros((40, 66), np.float32)
-    wrong = Disparity(7, small, small.astype(np.uint8), small)
-    with pytest.raises(ValueError, match=r"Upsample: .*\(40, 66\)"):
-        Upsample()(frame, wrong)
-    with pytest.raises(ValueError, match=r"LeftRightCheck: .* at the same size"):
-        LeftRightCheck()(wrong, Disparity(7, small[:30], small[:30].astype(np.uint8), small[:30]))
-
-
 def test_half_an_image_is_the_mean_of_four_and_repeats_an_odd_border():
     image = np.array([[0, 8, 100], [4, 16, 110], [20, 40, 7]], np.uint8)
     assert halved(image).tolist() == [[7, 105], [30, 7]]
     colour = np.random.default_rng(3).integers(0, 256, (40, 60, 3), dtype=np.uint8)
     means = colour.reshape(20, 2, 30, 2, 3).mean(axis=(1, 3))
     assert np.abs(halved(colour) - means).max() <= 0.5
-
-
-def test_data_of_different_times_are_refused():
-    frame, _ = slope_frame()
-    small = np.zeros((49, 66), np.float32)
-    early = Disparity(7, small, small.astype(np.uint8), small)
-    late = Disparity(8, small, small.astype(np.uint8), small)
-    with pytest.raises(ValueError, match="Upsample: frame of 7 ns, disparity of 8 ns: join data"):
-        Upsample()(frame, late)
-    with pytest.raises(ValueError, match="LeftRightCheck: disparity of 7 ns, backward of 8 ns: join data"):
-        LeftRightCheck()(early, late)
 
 
 def test_a_frame_too_small_to_halve_names_its_own_size_and_the_way_out():

@@ -184,12 +184,6 @@ def test_two_frames_at_once_give_the_bits_of_one_after_the_other(box):
         assert alone[0] != alone[1]
 
 
-def test_a_disparity_of_another_time_is_refused(box):
-    frame, matches, _ = box
-    with pytest.raises(ValueError, match="Refine: frame of 5 ns, disparity of 6 ns: join data"):
-        Refine()(frame, replace(matches, stamp=6))
-
-
 # Without subpixel fit, median and planes nothing else smooths.
 BARE = {
     "superpixels": 200,
@@ -259,13 +253,6 @@ def test_pixels_that_stay_unknown_keep_the_reason_of_the_matcher(box):
     assert np.array_equal(refined.source[unknown], reasons[unknown])
     assert unknown.any()
     assert np.array_equal(refined.pixels, Refine()(frame, matches).pixels, equal_nan=True)
-
-
-def test_a_disparity_of_another_size_is_refused(box):
-    frame, matches, _ = box
-    small = Disparity(5, matches.pixels[:50], matches.source[:50], matches.confidence[:50])
-    with pytest.raises(ValueError, match=r"\(50, 160\)"):
-        Refine()(frame, small)
 
 
 @pytest.mark.parametrize("parameters", [{}, {"surface_size": 0, "median_size": 3}])
