@@ -6,7 +6,7 @@ are called `use/stream`. A template is found in the pipeline file, in a YAML fil
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -101,28 +101,6 @@ class StreamSpec:
     scope: Scope | None = None
 
 
-@dataclass(frozen=True)
-class Expansion:
-    """The streams of a pipeline. templates: use -> template, for the uses in the pipeline file itself."""
-
-    streams: Mapping[str, StreamSpec]
-    templates: Mapping[str, TemplateUse]
-    inputs: Sequence[TemplateInput]
-
-
-def expand(streams: Mapping[str, Value], library: Library, changes: Iterable[Change]) -> Expansion:
-    """The streams of a pipeline with every template expanded and the changes of streams applied."""
-    work = _Expander(library, list(changes))
-    for name, item in streams.items():
-        check_name(name, item.place)
-        work.add(name, name, item)
-    for change in work.changes:
-        meant = nearest(change.target, work.paths)
-        raise change.value.place.error(f"there is no stream '{change.target}'{meant}")
-    top = {name: work.used[name] for name in streams if name in work.used}
-    return Expansion(work.streams, top, work.inputs)
-
-
 def check_name(name: str, place: YamlLocation) -> None:
     """Refuse a name that no stream can have."""
     if not (name.isascii() and name.isidentifier()):
@@ -172,26 +150,34 @@ class Library:
         return Template.read(found.stem, read(text, lambda line: YamlLocation(shown, line)))
 
 
-class _Expander:
-    """The expansion as far as it has come. changes: those not applied yet; paths: what changes can name."""
+class Expansion:
+    """The streams of a pipeline with every template expanded and the changes of streams applied.
 
-    def __init__(self, library: Library, changes: list[Change]) -> None:
-        self.library, self.changes = library, changes
+    templates: use -> template, for the uses in the pipeline file itself; inputs: of all uses.
+    """
+
+    def __init__(self, streams: Mapping[str, Value], library: Library, changes: Iterable[Change]) -> None:
         self.streams: dict[str, StreamSpec] = {}
-        self.used: dict[str, TemplateUse] = {}
+        self.templates: dict[str, TemplateUse] = {}
         self.inputs: list[TemplateInput] = []
-        self.paths: list[str] = []
+        self._library, self._paths, self._left = library, list[str](), list(changes)  # paths: what changes can name
+        for name, item in streams.items():
+            check_name(name, item.place)
+            self._add(name, name, item)
+        for change in self._left:
+            meant = nearest(change.target, self._paths)
+            raise change.value.place.error(f"there is no stream '{change.target}'{meant}")
 
-    def add(self, name: str, path: str, item: Value, scope: Scope | None = None, within: tuple[str, ...] = ()) -> None:
+    def _add(self, name: str, path: str, item: Value, scope: Scope | None = None, within: tuple[str, ...] = ()) -> None:
         """Add the stream `name`, or the streams of the template that it uses; within: the templates around it."""
-        self.paths.append(path)
+        self._paths.append(path)
         is_use = _is_use(item)
         for change in self._taken(path, lambda change: not is_use or change.keys[0] == "template"):
             item = change.applied(item)
         if not _is_use(item):
             self.streams[name] = StreamSpec(item, scope)
             return
-        template = self.library.find(item.value["template"])
+        template = self._library.find(item.value["template"])
         if template.name in within:
             circle = " -> ".join([*within[within.index(template.name) :], template.name])
             raise item.value["template"].place.error(f"template '{template.name}' uses itself: {circle}")
@@ -200,13 +186,13 @@ class _Expander:
             item = change.applied(item)
         for change in self._taken(path, lambda change: True):  # of the output stream
             _check_key(change, template)
-            self.changes.append(replace(change, target=f"{path}/{template.output}"))
+            self._left.append(replace(change, target=f"{path}/{template.output}"))
         self._expand(name, path, item, template, scope, (*within, template.name))
 
     def _taken(self, path: str, wanted: Callable[[Change], bool]) -> list[Change]:
         """Take the changes of one entry from those that are left."""
-        taken = [change for change in self.changes if change.target == path and wanted(change)]
-        self.changes = [change for change in self.changes if change not in taken]
+        taken = [change for change in self._left if change.target == path and wanted(change)]
+        self._left = [change for change in self._left if change not in taken]
         return taken
 
     def _expand(
@@ -219,9 +205,10 @@ class _Expander:
                 valid = [*template.inputs, *template.parameters, "optional"]
                 meant = nearest(key, valid) or f"; it has {', '.join(valid)}"
                 raise value.key_place.error(f"template '{template.name}' has no input or parameter '{key}'{meant}")
-        own = {key: item.plain() for key, item in template.parameters.items()}
-        changed = {key: given[key].plain() for key in own if key in given and given[key].plain() != own[key]}
-        self.used[name] = TemplateUse(template.name, changed)
+        if scope is None:
+            own = {key: item.plain() for key, item in template.parameters.items()}
+            changed = {key: given[key].plain() for key in own if key in given and given[key].plain() != own[key]}
+            self.templates[name] = TemplateUse(template.name, changed)
         inputs = {}
         for key, kind in template.inputs.items():
             if key not in given:
@@ -236,7 +223,7 @@ class _Expander:
             moved = filled_in(_moved(item, use.place), values)
             if "optional" in use.value and isinstance(moved.value, dict):
                 moved = Value({**moved.value, "optional": use.value["optional"]}, moved.place)
-            self.add(names[key], f"{path}/{key}", moved, inner, within)
+            self._add(names[key], f"{path}/{key}", moved, inner, within)
 
 
 def resolved(port: str, given: Value, scope: Scope | None) -> str:

@@ -199,6 +199,7 @@ def test_graph_draws_a_template_as_one_box_or_its_streams(tmp_path):
     assert "Couple        = scaled_twice(both, factor=25 cm), 2 streams: --expand" in folded
     assert "out/first" not in folded.replace("sum   Couple        = tests.flow.toys.Add(out, out/first)", "")
     assert "out/first  Couple        = tests.flow.toys.Scale(both, factor=25 cm)" in expanded
+    assert "Couple        = outer(both, factor=25 cm), 4 streams: --expand" in draw(loaded(tmp_path, NESTED), "text")
     for form in ("mermaid", "svg"):
         assert "scaled_twice" in draw(graph, form)
         assert "out/first" in draw(graph, form, expand=True)
