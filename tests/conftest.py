@@ -132,6 +132,24 @@ def mcap_rows(log: Path) -> list[Row]:
         ]
 
 
+def chunks_of(log: Path) -> list[tuple[Any, set[str]]]:
+    """Each chunk in the index of a log, with the topics in it."""
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    topics = {number: channel.topic for number, channel in summary.channels.items()}
+    return [(chunk, {topics[number] for number in chunk.message_index_offsets}) for chunk in summary.chunk_indexes]
+
+
+def with_broken(log: Path, *chunks: Any) -> Path:
+    """The log beside it with broken chunks."""
+    content = bytearray(log.read_bytes())
+    for chunk in chunks:
+        content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
+    (damaged := log.with_name("damaged.mcap")).write_bytes(content)
+    return damaged
+
+
 def write_mcap(
     out: Path,
     rows: Iterable[Row],

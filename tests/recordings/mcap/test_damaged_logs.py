@@ -25,7 +25,7 @@ from recordings.inventory.text import format_description
 from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
-from tests.conftest import rewrite, write_mcap
+from tests.conftest import chunks_of, rewrite, with_broken, write_mcap
 from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essences, inventory_of, items_of, sound
 
 
@@ -110,14 +110,8 @@ def test_a_flipped_bit_never_becomes_data(sample, whole, tmp_path, layout, share
 
 def test_a_broken_chunk_loses_its_own_messages_with_their_times(sample, whole, tmp_path):
     full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500)
-    with full.open("rb") as file:
-        chunks = make_reader(file).get_summary().chunk_indexes
-        topics = {number: c.topic for number, c in make_reader(file).get_summary().channels.items()}
-    broken = next(c for c in chunks[3:] if [topics[n] for n in c.message_index_offsets] == [LEFT])
-    content = bytearray(full.read_bytes())
-    content[broken.chunk_start_offset + broken.chunk_length // 2] ^= 0xFF
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(content)
+    broken = next(chunk for chunk, topics in chunks_of(full)[3:] if topics == {LEFT})
+    damaged = with_broken(full, broken)
     events = items_of(damaged)
     lost = [(time, stream) for time, stream, item in events if isinstance(item, Exception)]
     assert lost == [(broken.message_start_time, "left")]
@@ -128,20 +122,12 @@ def test_a_broken_chunk_loses_its_own_messages_with_their_times(sample, whole, t
 
 def test_a_log_that_lost_all_images_reports_the_damage(sample, tmp_path):
     full = rewrite(sample, tmp_path / "full.mcap", chunk_size=500, use_statistics=False)
-    with full.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    content, broken = bytearray(full.read_bytes()), []
-    for chunk in summary.chunk_indexes:
-        if {summary.channels[number].topic for number in chunk.message_index_offsets} & {LEFT, RIGHT}:
-            content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
-            broken.append(chunk.chunk_start_offset)
-    damaged = tmp_path / "damaged.mcap"
-    damaged.write_bytes(content)
-    with McapSource().open(damaged) as log:
+    broken = [chunk for chunk, topics in chunks_of(full) if topics & {LEFT, RIGHT}]
+    with McapSource().open(with_broken(full, *broken)) as log:
         assert log.missing["left"].startswith(
             "the log has no camera images (sensor_msgs/Image or CompressedImage): "
             f"no message of {LEFT}, {RIGHT} can be read; give a log with images "
-            f"(messages were lost: the chunk at byte {broken[0]} is broken and its messages are lost"
+            f"(messages were lost: the chunk at byte {broken[0].chunk_start_offset} is broken and its messages are lost"
         )
         assert log.resolution.unavailable["left"].endswith("give a log with images")
 

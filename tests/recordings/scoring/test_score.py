@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation
 
 from flow.cli.main import main
@@ -22,7 +21,7 @@ from recordings.scoring.table import ROWS, SCORES, brief_figures, brief_row, for
 from recordings.simulator import Simulation, ground_truth, write_log
 from recordings.simulator.texture import TerrainClass
 from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
-from tests.conftest import rewrite
+from tests.conftest import chunks_of, rewrite, with_broken
 
 SMALL = Simulation(
     scene="mixed", frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
@@ -374,18 +373,12 @@ def test_no_terrain_table_if_no_map_fits(tmp_path, truth, frames):
 
 def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth, frames):
     run = Run().write(tmp_path / "run.mcap", frames)
-    with truth.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    numbers = {channel.topic: number for number, channel in summary.channels.items()}
     for topic in ("/truth/disparity", "/truth/rocks"):
-        content = bytearray(truth.read_bytes())
-        chunk = next(c for c in summary.chunk_indexes if numbers[topic] in c.message_index_offsets)
-        content[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 0xFF
-        damaged = tmp_path / "damaged.mcap"
-        damaged.write_bytes(content)
+        chunk, topics = next(each for each in chunks_of(truth) if topic in each[1])
+        damaged = with_broken(truth, chunk)
         found = scoring.score(run, damaged)
         assert found.frames == found.compared == 2
-        held = len(chunk.message_index_offsets.keys() & {numbers[name] for name in scoring.TRUTHS if name in numbers})
+        held = len(topics & {*scoring.TRUTHS})
         (why,) = found.lost[str(damaged)]
         assert why.startswith(f"the chunk at byte {chunk.chunk_start_offset} is broken")
         assert found.lost[str(damaged)][why] >= held

@@ -4,10 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 
 from recordings import McapSource
-from tests.conftest import rewrite
+from tests.conftest import chunks_of, rewrite, with_broken
 from tests.recordings.sample_log import (
     FRAMES,
     INFOS,
@@ -77,18 +76,10 @@ def test_a_calibration_change_before_the_range_is_known(tmp_path, layout):
 
 def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path):
     path = calibrated_once_more(tmp_path / "log.mcap", "small chunks", again=3)
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-        infos = {number for number, channel in summary.channels.items() if channel.topic == INFO}
-        broken = max(
-            (chunk for chunk in summary.chunk_indexes if infos & chunk.message_index_offsets.keys()),
-            key=lambda chunk: chunk.message_start_time,
-        )
-    content = bytearray(path.read_bytes())
-    content[broken.chunk_start_offset + broken.chunk_length // 2] ^= 0xFF
-    path.write_bytes(content)
+    infos = [chunk for chunk, topics in chunks_of(path) if INFO in topics]
+    broken = max(infos, key=lambda chunk: chunk.message_start_time)
     assert broken.message_start_time >= START + 60 * PERIOD
-    with McapSource().open(path, start=8.0) as log:
+    with McapSource().open(with_broken(path, broken), start=8.0) as log:
         read, lost = left_of(log.events())
         assert (read, lost[-1].rpartition("(")[2]) == ([], f"at or before {START + 2 * PERIOD} ns)")
 
