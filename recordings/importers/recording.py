@@ -19,20 +19,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.calibration.formats import StereoCalibration
 from recordings.errors import LogError
 from recordings.importers.files import encoding_of, image_size, read_bytes, read_pixels
-from recordings.importers.track import WORLD, Track, upright
+from recordings.importers.track import Track, upright
 from recordings.mcap.resumable import ResumableWriter
 from recordings.ros2 import to_msg as ros2
 from recordings.ros2.cdr import make
 from recordings.ros2.image_from_msg import is_cut
 from recordings.source.calibration import Camera, calibrated_pair, pinhole
 from recordings.source.transforms import TransformTree
-from stages.data import CameraModel, Pose, StereoCamera, Transform
+from stages.data import CameraModel, StereoCamera, Transform
 
 BASE, LEFT, RIGHT, IMU = "base_link", "left_camera_optical", "right_camera_optical", "imu_link"
 SIDES = ("left", "right")
@@ -199,14 +198,9 @@ def _true_pose(recording: ImportedRecording, stamp: int, camera: Camera, tree: T
         return
     base = tree.between(placed.child, BASE)
     body = placed.after(to_camera.after(camera.image) if base is None else base)
-    turn = Rotation.from_matrix(body.rotation).as_quat(canonical=True)
-    yield stamp, "/truth/pose", ros2.odometry(Pose(stamp, body.translation, turn, WORLD, body.child))
+    yield stamp, "/truth/pose", ros2.exact_odometry(body, stamp)
     if recording.true_tilt:
-        whole = Rotation.from_matrix(placed.after(to_camera).rotation).as_quat(canonical=True)
-        message = make(
-            "geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, LEFT), quaternion=ros2.quaternion(whole)
-        )
-        yield stamp, "/truth/tilt", message
+        yield stamp, "/truth/tilt", ros2.quaternion_stamped(placed.after(to_camera).rotation, stamp, LEFT)
 
 
 def common_size(pairs: Sequence[ImagePair]) -> tuple[int, int]:

@@ -243,6 +243,17 @@ def odometry(pose: Pose) -> Any:
     )  # fmt: skip
 
 
+def exact_odometry(place: Transform, stamp: int) -> Any:
+    """nav_msgs/Odometry of a pose without errors: world <- body."""
+    return odometry(Pose(stamp, place.translation, _turn(place.rotation), place.parent, place.child))
+
+
+def quaternion_stamped(rotation: Array, stamp: int, frame_id: str) -> Any:
+    """geometry_msgs/QuaternionStamped of a rotation (3, 3)."""
+    turn = quaternion(_turn(rotation))
+    return make("geometry_msgs/msg/QuaternionStamped", header=header(stamp, frame_id), quaternion=turn)
+
+
 def diagnostics(stamp: int, statuses: Iterable[tuple[int, str, str, dict[str, str]]]) -> Any:
     """diagnostic_msgs/DiagnosticArray of (level 0 ok / 1 warn / 2 error, name, message, values)."""
     return make(
@@ -271,13 +282,10 @@ def _region(width: int, height: int) -> Any:
 
 def transform_stamped(transform: Transform, stamp: int) -> Any:
     """geometry_msgs/TransformStamped."""
-    turn = canonical(quaternion_of(transform.rotation))
+    turn = quaternion(_turn(transform.rotation))
     return make(
         "geometry_msgs/msg/TransformStamped", header=header(stamp, transform.parent), child_frame_id=transform.child,
-        transform=make(
-            "geometry_msgs/msg/Transform",
-            translation=_vector(transform.translation), rotation=quaternion(turn),
-        ),
+        transform=make("geometry_msgs/msg/Transform", translation=_vector(transform.translation), rotation=turn),
     )  # fmt: skip
 
 
@@ -298,6 +306,11 @@ def quaternion(xyzw: Any) -> Any:
     """geometry_msgs/Quaternion."""
     x, y, z, w = (float(value) for value in xyzw)
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _turn(rotation: Array) -> Array:
+    """The quaternion xyzw of a rotation (3, 3)."""
+    return canonical(quaternion_of(rotation))
 
 
 def _flat(matrix: Array) -> Array:

@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
-from recordings.ros2.cdr import make
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
 from recordings.source.calibration import pinhole
-from stages.data import LEVEL_FRAME, Pose, Transform
+from stages.data import LEVEL_FRAME, Transform
 
 Logged = tuple[int, str, Any]
 
@@ -121,29 +120,15 @@ def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> d
 
 def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> dict[str, Any]:
     elevation, hazards = ground_truth.truth_maps(simulation, stamp, truth)
+    rocks = ground_truth.rocks_in_level(simulation, truth)
+    level_from_camera = truth.level.rotation.T @ truth.base.after(truth.mounts[0]).rotation
     return {
         "/truth/disparity": ros2.disparity_image(ground_truth.true_disparity(simulation, stamp, truth)),
         "/truth/occlusion": ros2.image(stamp, traverse.LEFT_FRAME, truth.seen),
         "/truth/terrain_class": ros2.image(stamp, traverse.LEFT_FRAME, truth.terrain_class),
         "/truth/elevation_map": ros2.grid_map(elevation),
         "/truth/navigation_map": ros2.occupancy_grid(hazards),
-        "/truth/rocks": _rocks_message(simulation, stamp, truth),
-        "/truth/tilt": _tilt_message(stamp, truth),
-        "/truth/pose": ros2.odometry(_true_pose(stamp, truth)),
+        "/truth/rocks": ros2.float_cloud(stamp, LEVEL_FRAME, ROCK_FIELDS, rocks),
+        "/truth/tilt": ros2.quaternion_stamped(level_from_camera, stamp, traverse.LEFT_FRAME),
+        "/truth/pose": ros2.exact_odometry(truth.base, stamp),
     }
-
-
-def _rocks_message(simulation: Simulation, stamp: int, truth: FrameTruth) -> Any:
-    return ros2.float_cloud(stamp, LEVEL_FRAME, ROCK_FIELDS, ground_truth.rocks_in_level(simulation, truth))
-
-
-def _true_pose(stamp: int, truth: FrameTruth) -> Pose:
-    quaternion = Rotation.from_matrix(truth.base.rotation).as_quat(canonical=True)
-    return Pose(stamp, truth.base.translation, quaternion, truth.base.parent, truth.base.child)
-
-
-def _tilt_message(stamp: int, truth: FrameTruth) -> Any:
-    """geometry_msgs/QuaternionStamped: level <- left camera, in the header of the camera."""
-    rotation = Rotation.from_matrix(truth.level.rotation.T @ truth.base.after(truth.mounts[0]).rotation)
-    turn = ros2.quaternion(rotation.as_quat(canonical=True))
-    return make("geometry_msgs/msg/QuaternionStamped", header=ros2.header(stamp, traverse.LEFT_FRAME), quaternion=turn)
