@@ -29,9 +29,6 @@ def write_report(path: Path, results: Sequence[Path]) -> None:
     facts += [read_facts(result, facts[0].drawn) for result in results[1:]]
     names = " and ".join(found.path.name for found in facts)
     parts = [
-        f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
-        '<meta name=viewport content="width=device-width, initial-scale=1">',
-        f"<title>{escape(names)}</title><style>{STYLE.read_text()}</style></head><body><h1>{escape(names)}</h1>",
         _beside([_verdict(found) for found in facts]),
         _section("What differs", _differences(results)),
         _section("Map", _beside([_regional(found) for found in facts])),
@@ -39,10 +36,19 @@ def write_report(path: Path, results: Sequence[Path]) -> None:
         *(_section(name.capitalize(), _beside([_frame(found, name) for found in facts])) for name in facts[0].drawn),
         _section("Losses", _beside([_losses(found) for found in facts])),
         _section("Parameters", _beside([_parameters(found) for found in facts])),
-        "</body></html>",
+    ]
+    write_page(path, names, parts)
+
+
+def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
+    """Write a page with a title and these parts, HTML."""
+    head = [
+        f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
+        '<meta name=viewport content="width=device-width, initial-scale=1">',
+        f"<title>{escape(title)}</title><style>{STYLE.read_text()}</style></head><body><h1>{escape(title)}</h1>",
     ]
     with written(path) as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8")
+        temporary.write_text("\n".join([*head, *parts, "</body></html>"]), encoding="utf-8")
 
 
 def _section(title: str, content: str) -> str:

@@ -5,18 +5,15 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from flow.cli.fleet.catalogue import NAME, Catalogue
 from flow.contracts import counted
-from recordings.atomic_write import written
 from recordings.errors import LogError
-from recordings.reporting.page import STYLE, html_table
+from recordings.reporting.page import html_table, write_page
 from recordings.scoring.score import score
 from recordings.scoring.table import SCORES, brief_figures, brief_row
-from recordings.sinks.overwrite import REPORT
 
 _COLUMNS = ("name", "verdict", "frames", "losses", "findings", "seconds", "why")
 
@@ -29,17 +26,9 @@ def write_fleet_page(path: Path, folder: Path) -> None:
     gigabytes = sum(row["bytes"] or 0 for row in rows) / 1e9
     facts = [(name, str(number)) for name, number in ended.items()]
     facts += [("hours of runs", f"{hours:.2f}"), ("GB", f"{gigabytes:.2f}")]
-    title = escape(folder.resolve().name)
     cells = [[_cell(row, column) for column in _COLUMNS] for row in rows]
-    parts = [
-        f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
-        '<meta name=viewport content="width=device-width, initial-scale=1">',
-        f"<title>{title}</title><style>{STYLE.read_text()}</style></head><body><h1>{title}</h1>",
-        f"<p>{counted(len(rows), 'log')}</p>{html_table(facts)}",
-        f"<h2>Logs</h2>{html_table(cells, _COLUMNS)}</body></html>",
-    ]
-    with written(path) as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8")
+    about = f"<p>{counted(len(rows), 'log')}</p>{html_table(facts)}"
+    write_page(path, folder.resolve().name, [about, f"<h2>Logs</h2>{html_table(cells, _COLUMNS)}"])
 
 
 def score_rows(folder: Path) -> dict[str, list[tuple[str, ...]]]:
