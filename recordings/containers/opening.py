@@ -32,9 +32,9 @@ def open_recording(given: Path | Sequence[Path]) -> Recording:
             file = _open_file(path, stack)
             stack.callback(file.close)
             opened.append(file)
-        path = given if isinstance(given, Path) else given[0]
-        return Recording(path, opened, found.missing, found.part, stack.pop_all().close)
-    raise AssertionError
+        close = stack.pop_all().close
+    path = given if isinstance(given, Path) else given[0]
+    return Recording(path, opened, found.missing, found.part, close)
 
 
 def _open_file(path: Path, stack: ExitStack) -> Container:

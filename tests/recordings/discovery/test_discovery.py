@@ -140,8 +140,9 @@ def test_transforms_with_no_pose_or_two_are_refused(tmp_path, links, sentence):
         assert f"the source's 'odometry' is set to /tf, where {sentence}" in log.refused["odometry"]
 
 
-def test_the_pose_in_odom_is_preferred_to_that_in_map(tmp_path):
-    path = moving(tmp_path / "log.mcap", WHEEL, MAP, ODOM)
+@pytest.mark.parametrize("links", [(WHEEL, MAP, ODOM), (("/odom", "/base_link"),)], ids=["map", "leading slash"])
+def test_the_pose_in_odom_is_preferred_to_that_in_map_and_a_leading_slash_is_ignored(tmp_path, links):
+    path = moving(tmp_path / "log.mcap", *links)
     assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
@@ -152,11 +153,6 @@ def test_a_pose_of_a_frame_not_joined_to_the_camera_is_refused(tmp_path, given):
         sentence = "/odom is the pose of 'foot', but no static transform joins it to the camera 'left_optical'"
         assert sentence in log.missing["odometry"]
         assert ("odometry" in log.refused) == (given is not None)
-
-
-def test_a_leading_slash_of_a_frame_is_ignored(tmp_path):
-    path = moving(tmp_path / "log.mcap", ("/odom", "/base_link"))
-    assert {(pose.frame_id, pose.child_frame_id) for _, _, pose in items_of(path, McapSource(odometry="/tf"))} == {ODOM}
 
 
 def test_the_pose_is_that_of_the_set_base_frame(tmp_path):
@@ -173,16 +169,11 @@ def test_an_imu_without_unit_quaternions_is_no_inclinometer(tmp_path, bad):
         assert sentence in log.missing["inclinometer"]
 
 
-def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path):
-    edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)}, [0])
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert log.missing == {}
-        losses = [(stream, str(item)) for _, stream, item in log.events() if isinstance(item, Exception)]
-    assert [stream for stream, _ in losses] == ["inclinometer"]
-
-
-def test_an_imu_that_is_invalid_for_long_is_an_inclinometer(tmp_path, monkeypatch):
-    edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)}, range(FRAMES - 2))
+@pytest.mark.parametrize("invalid", [1, FRAMES - 2])
+def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path, monkeypatch, invalid):
+    edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)}, range(invalid))
     monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
+        losses = [stream for _, stream, item in log.events() if isinstance(item, Exception)]
+    assert losses == ["inclinometer"] * invalid
