@@ -181,11 +181,7 @@ def _seams(simulation: Simulation, log: Path, frames: dict[int, dict[str, object
 def _upright(poses: Sequence[Pose], stamp: int) -> Transform:
     """Frame `level` by the position and heading of the pose at `stamp`."""
     later = next(place for place, pose in enumerate(poses) if pose.stamp >= stamp)
-    pose = poses[later - 1].interpolated(poses[later], stamp)
-    x, y, z, w = pose.quaternion
-    heading = np.arctan2(2 * (x * y + z * w), 1 - 2 * (y * y + z * z))
-    c, s = np.cos(heading), np.sin(heading)
-    return Transform(pose.frame_id, LEVEL_FRAME, np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), pose.position)
+    return traverse.level_pose(poses[later - 1].interpolated(poses[later], stamp).transform)
 
 
 def _heights(points: Array, placed: Transform) -> tuple[Array, Array]:
