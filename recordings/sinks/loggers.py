@@ -35,7 +35,9 @@ from stages.data import (
 )
 from stages.data.rotations import matrix_of
 
-DISPARITY_STEPS = 4  # disparities are drawn to 1/4 px; the result log has them as they are
+# Drawn steps of a px, a px and a metre; the result log has the values as they are
+DISPARITY_STEPS, SIGMA_STEPS, DEPTH_STEPS = 4, 250, 250
+POINT_STEPS = 512  # of a metre; a power of 2, so that the lower bits of the drawn points are 0
 ALL_CODES = np.arange(256, dtype=np.uint8)
 # Layer -> the upper end of its scale, twice the usual limit, and its unit
 LAYER_SCALES = {
@@ -154,8 +156,9 @@ def _log_sigma(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         pixels, sigma = (
             colormaps.every_nth(layer, canvas.small_width) for layer in (disparity.pixels, disparity.sigma)
         )
-        values = np.where(np.isnan(pixels), np.float32(np.nan), sigma).astype(np.float16)
-        canvas.log_values(values, (0.0, MAX_SIGMA), ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma"), "px")
+        steps = _steps(np.where(np.isnan(pixels), pixels, sigma), SIGMA_STEPS)
+        view = ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma")
+        canvas.log_steps(steps, SIGMA_STEPS, MAX_SIGMA, view, "px")
 
 
 def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
@@ -164,16 +167,21 @@ def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         shifted = colormaps.every_nth(disparity.pixels, canvas.small_width) + np.float32(camera.cx_right - camera.cx)
         depth = camera.fx * camera.baseline / np.where(shifted > 0, shifted, np.float32(np.nan))
         view = ViewSpec(Panel.DEPTH, stream, "depth", f"{stream}: depth")
-        canvas.log_values(depth.astype(np.float16), (0.0, MAX_DEPTH), view, "m")
+        canvas.log_steps(_steps(depth, DEPTH_STEPS), DEPTH_STEPS, MAX_DEPTH, view, "m")
+
+
+def _steps(values: Array, per_unit: float) -> Array:
+    """Values (H, W) in whole steps, uint16; NaN and negative values become 0."""
+    steps: Array = cv2.multiply(np.ascontiguousarray(values), per_unit, dtype=cv2.CV_16U)  # type: ignore[call-overload]
+    return steps
 
 
 def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int, filled: Array | None) -> None:
     """The disparities of every n-th pixel, with their scale. filled: which of these are faint, as guesses are."""
-    # Rounded; NaN and negative values become 0.
-    thinned = np.ascontiguousarray(colormaps.every_nth(pixels, max_width))
-    steps: Array = cv2.multiply(thinned, DISPARITY_STEPS, dtype=cv2.CV_16U)  # type: ignore[call-overload]
+    thinned = colormaps.every_nth(pixels, max_width)
     _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(thinned))
     view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)
+    steps = _steps(thinned, DISPARITY_STEPS)
     canvas.log_steps(steps, DISPARITY_STEPS, limit, view, "px", veiled=("filled", filled))
 
 
@@ -183,7 +191,8 @@ def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
     if cloud.sensor is not None:
         if canvas.pictures:
             some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
-            points = rr.Points3D(cloud.points[some], colors=cloud.colors[some], radii=rr.Radius.ui_points(2.0))
+            places = np.rint(POINT_STEPS * cloud.points[some]) / np.float32(POINT_STEPS)
+            points = rr.Points3D(places, colors=cloud.colors[some], radii=rr.Radius.ui_points(2.0))
             view = ViewSpec(Panel.CLOUD, stream, "points", stream, cloud.frame_id)
             canvas.log(view.path, points, view)
         # An optical axis (z) below the horizon is pitch down; the image's right side (x) below it is roll right.

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from recordings.sinks.loggers import same_view
+from recordings.sinks.loggers import DEPTH_STEPS, POINT_STEPS, same_view
 from stages.data import LEVEL_FRAME, Cell, ElevationMap, PixelOrigin, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
     HEIGHT,
@@ -113,7 +113,7 @@ def test_the_same_pixels_are_stored_once(rrd, tmp_path):
 def test_clouds_are_thinned_by_a_fixed_stride(tmp_path):
     path = record_of(tmp_path / "few.rrd", [Record(START, scene())], max_points=300)
     positions = rows(path, "/points/points", "Points3D:positions")[0][2]
-    np.testing.assert_array_equal(positions, scene()["points"].points[::4])
+    np.testing.assert_allclose(positions, scene()["points"].points[::4], rtol=0, atol=0.5 / POINT_STEPS)
 
 
 def test_a_cloud_in_the_camera_frame_is_not_drawn(rrd):
@@ -204,9 +204,10 @@ def test_the_depth_of_the_last_disparity_is_under_the_cursor(tmp_path):
     camera = StereoCamera(80, 80, 31.5, 23.5, 0.2, 64, 48, cx_right=33.5)
     items["disparity"] = replace(items["disparity"], pixels=pixels, camera=camera, sigma=None)
     path = record_of(tmp_path / "run.rrd", [Record(START, items)], max_width=180)
-    ((_, _, (buffer,)),) = rows(path, "/disparity/depth", "DepthImage:buffer")
-    depth = np.array(buffer, np.uint8).view(np.float16).reshape(48, 64)
-    assert np.isnan(depth[:8]).all()
+    depth = decoded(rows(path, "/disparity/depth", "EncodedDepthImage:blob")[0][2][0], cv2.IMREAD_UNCHANGED)
+    assert rows(path, "/disparity/depth", "EncodedDepthImage:meter")[0][2][0] == DEPTH_STEPS
+    assert not depth[:8].any()  # unknown
+    depth = depth / DEPTH_STEPS
     np.testing.assert_allclose(depth[8:16], 80 * 0.2 / 2.0, rtol=1e-3)
     np.testing.assert_allclose(depth[16:], 80 * 0.2 / 6.0, rtol=1e-3)
     assert not [entity for entity in entities(path) if entity.startswith("/matched/depth")]
