@@ -58,10 +58,10 @@ class Refine(Stage):
     """A denser and smoother disparity image, with its superpixels.
 
     A match that moves by at most 0.5 px and two sigmas stays MEASURED if the images correlate over its support and its
-    sigma is small, else it becomes FILLED. A match that moves farther becomes PLANE, as does a hole that a plane fills.
-    Other filled holes are FILLED, but MEASURED where both cameras see them and their support passes the same tests. The
-    confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that stays unknown keeps
-    its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or OUT_OF_VIEW. See
+    sigma is small, else it becomes FILLED. A match that moves farther becomes PLANE. A hole that a plane fills is
+    PLANE, another filled hole FILLED, but either is MEASURED where both cameras see it and its support passes the same
+    tests. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that stays
+    unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or OUT_OF_VIEW. See
     docs/refinement.md.
 
     References

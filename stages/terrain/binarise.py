@@ -32,7 +32,7 @@ class Binarise(Stage):
     """Classifies each cell as free, hazard or unknown, with the reason.
 
     Method "rover" applies the hazard rule of docs/terrain.md. Method "absolute" is the paper's: a cell whose elevation
-    exceeds the rover's max_step is a hazard, all other cells with points are free.
+    exceeds the rover's max_step is a hazard, other cells with at least `min_points` points are free.
 
     Examples
     --------

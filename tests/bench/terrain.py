@@ -4,8 +4,8 @@ Run as `python -m tests.bench.terrain [--seeds 11 12 13] [--rocks 0.05 0.15] [--
 [--camera BASELINE HEIGHT DEG] [--json FILE]`; a stride of 10 makes a short form. Ground of 5 degrees RMS over 1 m, that
 is slopes to 15 degrees and a few beyond; inclinometer noise 0.3 degrees; everything else is the simulator's default.
 Each frame goes through the stages as the pipelines set them, one after the other on one core. Whether stated sigmas
-with the tilt's hold is counted for every frame with the tilt errors of all frames, and of as many times between: what
-they are off by, a frame's cells are off by together.
+with the tilt's hold is counted for every frame with the tilt errors of all frames, and of three times as many between:
+what they are off by, a frame's cells are off by together.
 """
 
 from __future__ import annotations
