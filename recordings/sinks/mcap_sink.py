@@ -56,7 +56,7 @@ _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 class McapSink:
     """Writes streams to /nav/<stream>, transforms to /tf, and losses, tilt health and findings to /nav/diagnostics.
 
-    Every type of item has a standard form (see docs/results.md). A stream of a type without one is refused when the
+    docs/writing-a-stage.md lists the forms of all types of items. A stream of a type without one is refused when the
     pipeline is loaded.
 
     Examples
