@@ -203,7 +203,7 @@ def asked(graph: Graph, outputs: Mapping[str, Path]) -> Graph:
 
 
 def with_spare_threads(graph: Graph, frames: int | None, workers: int) -> Graph:
-    """The graph for a run of fewer frames than workers: a stage with `threads` at its default uses two for a frame."""
+    """The graph for a run with two workers for each frame: a stage with `threads` at its default uses two for it."""
     return graph if frames is None or 2 * max(frames, 1) > workers else _with_default(graph, "threads", 2)
 
 
