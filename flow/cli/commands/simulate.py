@@ -26,7 +26,7 @@ OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
     "baseline": ("baseline", float, 1, "M", "distance between the cameras (0.24)"),
     "camera_height": ("camera_height", float, 1, "M", "height of the cameras above the ground (0.9)"),
     "pitch_down": ("pitch_down", float, DEGREE, "DEG", "angle of the cameras below the horizon (15)"),
-    "rocks": ("abundance", float, 1, "K", "share of ground under rocks: Golombek's k (0.1; dunes: 0.015; bedrock: 0.05)"),
+    "rocks": ("abundance", float, 1, "K", "share of ground under rocks, Golombek (0.1; dunes: 0.015; bedrock: 0.05)"),
     "slope": ("slope", float, DEGREE, "DEG", "RMS slope of the terrain (4)"),
     "sand": ("sand", float, PERCENT, "PERCENT", "ground that is sand (mixed: 45)"),
     "dust": ("dust", float, PERCENT, "PERCENT", "ground that is dust (mixed: 10)"),
