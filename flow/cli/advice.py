@@ -30,7 +30,7 @@ _SECONDS = {"fast": (0.15, 0.26), "rover": (0.15, 0.33), "accurate": (0.15, 0.55
 AMPLE = 1.5  # times the range that is enough, from which a smaller one is recommended
 _STARTING_SECONDS = 2.0  # before the first frame
 # Megabytes of a frame: at any size, and for each megapixel of the left image
-_LOG_MB, _RECORDING_MB = (0.9, 2.0), (0.65, 0.35)
+_LOG_MB, _RECORDING_MB = (0.9, 2.0), (0.57, 0.41)
 _SOURCE = re.compile(r"^source:.*\n(?:[ \t]+.*\n)*", re.MULTILINE)
 
 

@@ -27,6 +27,7 @@ TEXT_RGB: Rgb = (225, 228, 235)
 CAMERA_RGB: Rgb = (255, 210, 60)
 VEIL: tuple[int, int, int, int] = (96, 100, 112, 170)  # over guesses
 CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
+WHOLE_WIDTHS, MIN_SMALL_WIDTH = (320, 640), 160  # px, of pictures of results and of intermediates
 LEGEND_COLUMNS = (4, 3)  # of a single row, and of several, which have the longer names
 VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
     cv2.COLORMAP_TURBO: rr.components.Colormap.Turbo,
@@ -51,7 +52,7 @@ class Canvas:
     recording: rr.RecordingStream
     jpeg_quality: int
     max_points: int
-    max_width: int
+    max_width: int  # of a picture, px; 0: by the camera's images
     pictures: bool = True  # whether this frame's images, clouds and surfaces are drawn
     full_size: frozenset[str] = frozenset()  # streams of disparities and images that are no intermediates
     sized: frozenset[str] = frozenset()  # all streams of disparities and images
@@ -126,13 +127,21 @@ class Canvas:
                 self.recording.log(f"{LEDGER}/{path}", rr.TextLog(line, level=level))
 
     @property
+    def whole_width(self) -> int:
+        """The widest picture of a result, px."""
+        if self.max_width:
+            return self.max_width
+        least, most = WHOLE_WIDTHS
+        return min(max(self.camera.width // 2, least), most) if self.camera else most
+
+    @property
     def small_width(self) -> int:
         """The widest picture of an intermediate, px."""
-        return max(1, self.max_width * 3 // 8)
+        return max(self.whole_width * 3 // 8, 1 if self.max_width else MIN_SMALL_WIDTH)
 
     def width(self, stream: str) -> int:
         """The widest picture of a stream of disparities or images, px."""
-        return self.small_width if stream in self.sized - self.full_size else self.max_width
+        return self.small_width if stream in self.sized - self.full_size else self.whole_width
 
     def log_exact(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as PNG."""

@@ -123,8 +123,8 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         _log_confidence(canvas, ViewSpec(Panel.MATCH_CONFIDENCE, stream, "confidence", title), disparity)
     if disparity.segments is not None:
         # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
-        segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.max_width)
-        segments = np.ascontiguousarray(colormaps.every_nth(segments, canvas.max_width))
+        segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.whole_width)
+        segments = np.ascontiguousarray(colormaps.every_nth(segments, canvas.whole_width))
         lines = png(colormaps.segment_edges(segments))
         style = {"media_type": "image/png", "opacity": 0.4 / step, "draw_order": 10.0}
         view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")

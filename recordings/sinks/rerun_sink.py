@@ -39,8 +39,12 @@ class RerunSink:
     """
 
     application_id: str = parameter("roverflow", "recordings of one application share the layout that the viewer saves")
-    max_points: int = parameter(12_000, "most points drawn of a cloud", low=1)
-    max_width: int = parameter(640, "widest picture; an intermediate has three eighths of it", low=8, unit="px")
+    max_points: int = parameter(8_000, "most points drawn of a cloud", low=1)
+    max_width: int = parameter(
+        0, "widest picture; an intermediate has three eighths of it. 0: half as wide as the camera's images, but 320 "
+        "to 640 px, and intermediates 160 to 240 px",
+        low=0, unit="px",
+    )  # fmt: skip
     jpeg_quality: int = parameter(75, "of the camera images", low=1, high=100)
     every: int = parameter(1, "images, clouds and surfaces of each n-th frame are drawn", low=1)
     max_megabytes: int = parameter(

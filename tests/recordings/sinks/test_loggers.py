@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
+from recordings.sinks.canvas import Canvas
 from recordings.sinks.loggers import DEPTH_STEPS, POINT_STEPS, same_view
 from stages.data import LEVEL_FRAME, Cell, ElevationMap, PixelOrigin, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
@@ -108,6 +109,16 @@ def test_the_same_pixels_are_stored_once(rrd, tmp_path):
     raw = items["stereo"]
     items["stereo"] = StereoFrame(raw.stamp, raw.left.copy(), raw.right, raw.camera)
     assert {"/stereo/left", "/rectified/left"} <= entities(record_of(tmp_path / "raw.rrd", [Record(START, items)]))
+
+
+@pytest.mark.parametrize(
+    ("camera_width", "max_width", "widths"),
+    [(1280, 0, (640, 240)), (640, 0, (320, 160)), (64, 0, (320, 160)), (1280, 1280, (1280, 480))],
+)
+def test_pictures_follow_the_size_of_the_images_unless_a_width_is_set(camera_width, max_width, widths):
+    camera = StereoCamera(80, 80, 31.5, 23.5, 0.2, camera_width, 48)
+    canvas = Canvas(None, jpeg_quality=75, max_points=1, max_width=max_width, camera=camera)
+    assert (canvas.whole_width, canvas.small_width) == widths
 
 
 def test_clouds_are_thinned_by_a_fixed_stride(tmp_path):
