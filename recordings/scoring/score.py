@@ -281,20 +281,21 @@ class _Tally:
         return self.terrain.add(ground, fitting.get("/nav/elevation_map", {}), fitting.get("/nav/navigation_map"))
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
-        item, true = frame.get("/tf"), frame["/truth/tilt"]
-        camera = "" if item is None else item.child_frame_id.removeprefix(OWN_FRAME)
-        mount = self.mounts.get(camera)
-        true_up = _rotation(true.quaternion)[2]  # in the axes of its header
-        if item is None:
-            why = f"the result has no /tf from '{LEVEL_FRAME}' at that stamp"
-        elif camera != true.header.frame_id and (mount is None or mount.header.frame_id != true.header.frame_id):
-            why = f"the truth has no mount of '{camera}' on '{true.header.frame_id}'"
-        else:
-            if mount is not None and camera != true.header.frame_id:
-                true_up = true_up @ _rotation(mount.transform.rotation)
+        """The tilt's error, of a camera that the truth has; frame `level` may contain others, such as of pictures."""
+        placed = {item.child_frame_id.removeprefix(OWN_FRAME): item for item in frame.get("/tf", ())}
+        true = frame["/truth/tilt"]
+        body, true_up = true.header.frame_id, _rotation(true.quaternion)[2]  # up is in the axes of its header
+        mounts = {name: mount for name, mount in self.mounts.items() if mount.header.frame_id == body}
+        camera = next((name for name in placed if name == body or name in mounts), None)
+        if camera is not None:
+            if camera != body:
+                true_up = true_up @ _rotation(mounts[camera].transform.rotation)
             # Gravity's opposite in camera axes is independent of the heading.
-            self.tilts.append(angle_between(_rotation(item.transform.rotation)[2], true_up))
+            self.tilts.append(angle_between(_rotation(placed[camera].transform.rotation)[2], true_up))
             return {"tilt": self.tilts[-1]}
+        why = f"the truth has no mount of '{next(iter(placed), '')}' on '{body}'"
+        if not placed:
+            why = f"the result has no /tf from '{LEVEL_FRAME}' at that stamp"
         self.found.untilted[why] = self.found.untilted.get(why, 0) + 1
         return {}
 

@@ -19,14 +19,14 @@ Messages = Iterator[tuple[str, int, Any]]  # topic, log time in ns, message
 def frames(*logs: Messages) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, {topic: message}) of all frames, each when it is complete.
 
-    Of /tf, "/tf" is the transform whose parent is frame `level`.
+    Of /tf, "/tf" is the list of transforms whose parent is frame `level`.
     """
     waiting: dict[int, dict[str, Any]] = {}
     for topic, time, message in heapq.merge(*map(_by_header_clock, logs), key=lambda item: item[1]):
         if topic == "/tf":
             for item in message.transforms:
                 if item.header.frame_id == LEVEL_FRAME:
-                    waiting.setdefault(stamp_of(item.header), {})["/tf"] = item
+                    waiting.setdefault(stamp_of(item.header), {}).setdefault("/tf", []).append(item)
             continue
         waiting.setdefault(stamp_of(message.header), {})[topic] = message
         for stamp in [stamp for stamp in waiting if stamp < time - MAX_DELAY]:

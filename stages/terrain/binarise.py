@@ -88,11 +88,10 @@ class Binarise(Stage):
         height = elevation.layers["elevation"]
         observed = np.isfinite(height)
         if self.method == "absolute":
-            reason = np.where(observed & (height > self.rover.max_step), CellReason.ELEVATION, CellReason.CLEAR)
+            reason = self._sure(elevation)
+            reason[observed & (height > self.rover.max_step)] = CellReason.ELEVATION
         else:
             reason = self._rover_reasons(elevation, observed)
-        if "count" in elevation.layers:
-            reason[(reason == CellReason.CLEAR) & (elevation.layers["count"] < self.min_points)] = CellReason.UNSURE
         hidden = elevation.layers.get("occluded", np.zeros_like(height)) == 1
         seen = np.isfinite(elevation.layers.get("unmatched", np.full_like(height, np.nan)))
         reason[~observed] = np.where(hidden, CellReason.OCCLUDED, CellReason.UNOBSERVED)[~observed]
@@ -109,8 +108,7 @@ class Binarise(Stage):
         slope, steepness, roughness = (elevation.layers[name] for name in ("slope", "steepness", "roughness"))
         high, belly = self._obstacles(elevation, observed)
         limit = self.rover.max_slope + _SLOPE_ROUNDING
-        unsure = np.logical_or.reduce([*self.doubts(elevation).values()])
-        reason = np.where(unsure, CellReason.UNSURE, CellReason.CLEAR)
+        reason = self._sure(elevation)
         reason[_dilated(high | belly, self.hazard_margin / elevation.resolution)] = CellReason.BESIDE
         reason[roughness > self.max_roughness] = CellReason.ROUGHNESS
         reason[(slope > limit) | (steepness > limit)] = CellReason.SLOPE
@@ -124,8 +122,19 @@ class Binarise(Stage):
         high = observed & (elevation.layers["step"] >= self.rover.max_step - self.height_margin)
         return high, observed & (above >= self.rover.ground_clearance - self.height_margin)
 
+    def _sure(self, elevation: ElevationMap) -> Array:
+        """CLEAR, or UNSURE for a doubt, (rows, cols)."""
+        unsure = np.logical_or.reduce([np.zeros(elevation.shape, bool), *self.doubts(elevation).values()])
+        return np.where(unsure, CellReason.UNSURE, CellReason.CLEAR)
+
     def doubts(self, elevation: ElevationMap) -> dict[str, Array]:
-        """Doubt, in words -> cells (rows, cols) bool that method "rover" does not call free because of it."""
+        """Doubt, in words -> cells (rows, cols) bool that are not free because of it."""
+        found = {} if self.method == "absolute" else self._rover_doubts(elevation)
+        if "count" in elevation.layers:
+            found["fewer points than min_points"] = elevation.layers["count"] < self.min_points
+        return found
+
+    def _rover_doubts(self, elevation: ElevationMap) -> dict[str, Array]:
         ground, step, slope, steepness, roughness, support = (elevation.layers[name] for name in LAYERS)
         observed, above = np.isfinite(elevation.layers["elevation"]), elevation.layers["elevation"] - ground
         obstacle = np.logical_or(*self._obstacles(elevation, observed))
@@ -140,8 +149,6 @@ class Binarise(Stage):
         }
         if "variance" in elevation.layers:
             found["sigma above max_sigma"] = ~(elevation.layers["variance"] <= self.max_sigma**2)
-        if "count" in elevation.layers:
-            found["fewer points than min_points"] = elevation.layers["count"] < self.min_points
         return found
 
     def _cut(self, elevation: ElevationMap, observed: Array, above: Array, step: Array) -> Array:

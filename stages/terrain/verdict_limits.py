@@ -58,7 +58,7 @@ def limits_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> dict
 
 def doubts_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[str]:
     """In words, all that keeps the rule from calling a cell without a hazard free."""
-    if rule.method == "absolute" or math.isnan(terrain.layers["elevation"][row, col]):
+    if math.isnan(terrain.layers["elevation"][row, col]):
         return []
     part, row, col = _around(terrain, row, col)
     return [doubt for doubt, cells in rule.doubts(part).items() if cells[row, col]]

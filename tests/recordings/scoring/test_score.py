@@ -94,6 +94,7 @@ class Run:
         level_from_camera = frame.level.inverse().after(frame.base.after(SMALL.mounts[0]))
         off = Rotation.from_rotvec([0.6 * self.tilt_error, 0.8 * self.tilt_error, 0]).as_matrix()
         found = Transform("level", self.camera, off @ level_from_camera.rotation, level_from_camera.translation)
+        picture = Transform("level", "navigation_map/above", np.eye(3), np.zeros(3))  # of a viewer's picture of the map
         reason = np.zeros(cells.shape, np.uint8)
         return {
             "/nav/disparity": ros2.disparity_image(disparity),
@@ -105,7 +106,7 @@ class Run:
             "/nav/navigation_map": ros2.occupancy_grid(
                 NavigationMap(stamp, cells, reason, self.navigation or self.resolution, origin, "level")
             ),
-            "/tf": ros2.transform_message([(found, stamp)]),
+            "/tf": ros2.transform_message([(found, stamp), (picture, stamp)]),
         }
 
 

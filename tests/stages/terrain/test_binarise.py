@@ -14,6 +14,7 @@ from scipy.ndimage import binary_dilation
 from stages.data import Array, Cell, CellReason, ElevationMap, MatchFailure, NavigationMap, Rover
 from stages.terrain.binarise import Binarise
 from stages.terrain.features import TerrainFeatures
+from stages.terrain.verdict_limits import doubts_at
 from tests.stages.terrain.terrain_scene import Terrain, map_of, rolling_terrain
 
 TEN_DEGREES = float(np.deg2rad(10))
@@ -347,6 +348,16 @@ def test_cells_with_few_points_and_empty_maps_are_unknown() -> None:
     assert result.cells[7, 9] == Cell.UNKNOWN
     assert (result.cells == Cell.FREE).sum() == 1599
     assert (decided(map_of(np.full((40, 40), np.nan))).cells == Cell.UNKNOWN).all()
+
+
+@pytest.mark.parametrize("method", ["rover", "absolute"])
+def test_the_doubts_of_a_cell_with_few_points_name_min_points(method: str) -> None:
+    count = np.full((80, 80), 5.0)
+    count[40, 40] = 2
+    terrain, rule = TerrainFeatures()(map_of(np.zeros((80, 80)), count=count)), Binarise(method=method, min_points=3)
+    assert rule(terrain).reason[40, 40] == CellReason.UNSURE
+    assert doubts_at(rule, terrain, 40, 40) == ["fewer points than min_points"]
+    assert doubts_at(rule, terrain, 40, 42) == []
 
 
 def test_only_the_absolute_rule_makes_a_gentle_slope_a_hazard() -> None:
