@@ -1,4 +1,7 @@
-"""Two rectified images to a picture of the terrain: python two_images_to_dem.py left.png right.png dem.png"""
+"""Two rectified images to a picture of the terrain: python two_images_to_dem.py left.png right.png dem.png
+
+The camera and its attitude are those of `roverflow simulate --size 640x480`; put yours there.
+"""
 
 import sys
 
