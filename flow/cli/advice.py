@@ -123,7 +123,7 @@ def _range_advice(found: Mapping[str, float] | None, graph: Graph) -> list[str]:
         return [f"  the ground and rocks of {ROCK} m need fewer than the {searched} disparities: {enough} is faster"]
     if found["ground_px"] < searched:
         return []
-    return [f"  the near ground has more disparities than the {searched} that are searched: {enough} includes it"]
+    return [f"  the near ground has more disparities than the {searched} searched at full size: {enough} includes it"]
 
 
 def _flow(value: Any) -> str:
