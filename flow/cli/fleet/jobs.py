@@ -76,8 +76,8 @@ def reason_to_run(
     return ""
 
 
-def _logs(word: str, folder: Path) -> Iterable[Path]:
-    """The logs that a word of the command line names."""
+def _logs(word: str, folder: Path, where: str = "") -> Iterable[Path]:
+    """The logs that a word of the command line names, or a line of a text file. where: the end of its refusal."""
     path = Path(word)
     if path.is_dir():
         yield from _in_folder(path, folder)
@@ -87,13 +87,13 @@ def _logs(word: str, folder: Path) -> Iterable[Path]:
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"{path} is neither a log nor a text file of logs") from error
         for line in filter(None, (line.partition("#")[0].strip() for line in lines)):
-            yield from _logs(str(path.parent / line), folder)
+            yield from _logs(str(path.parent / line), folder, f", which {path} names")
     elif path.is_file():
         yield path
     else:
         found = sorted(glob(word, recursive=True))  # noqa: PTH207  # a pattern may be absolute
         if not found:
-            raise UsageError(f"no file, folder or pattern {word}")
+            raise UsageError(f"no file, folder or pattern {word}{where}")
         for item in found:
             yield from _logs(item, folder)
 
