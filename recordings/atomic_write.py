@@ -37,10 +37,11 @@ def give_name(temporary: Path, path: Path) -> None:
 
 @contextmanager
 def written(path: Path) -> Iterator[Path]:
-    """Yield a temporary name; rename it to `path` at the end, or delete it. Raises UnwritableError."""
+    """Yield the name of an empty file beside `path`; rename it at the end, or delete it. Raises UnwritableError."""
     temporary = temporary_name(path)
     try:
         with writing(path):
+            temporary.touch()  # rerun's writers raise a RuntimeError of their own where they cannot
             yield temporary
             give_name(temporary, path)
     finally:

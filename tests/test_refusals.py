@@ -284,13 +284,16 @@ def test_an_impossible_number_is_refused(traverse, tmp_path, option, value, prin
 def test_every_command_reports_an_unwritable_path_alike(traverse, result, tmp_path, said):
     scene = write_scene(tmp_path / "scenes" / "Box")
     (tmp_path / "cam.yaml").write_text("{fx: 100, cx: 10, cy: 10, baseline: 0.1}")
+    (tmp_path / "x.rrd").symlink_to(result.with_suffix(".rrd"))
     images = ("images", scene, "/proc/x.mcap", "--calibration", tmp_path / "cam.yaml", "--pitch-down", 20)
     for command in (
         ("run", traverse, *SMALL, "-o", "/proc/x.mcap", "--no-rrd"), ("simulate", "/proc/x.mcap", "--frames", 1),
         ("import", *images, "--height", 1), ("import", "middlebury", scene, "/proc/x.mcap"),
         ("import", "middlebury", scene.parent, "/proc/x"),
         ("score", result, "--truth", traverse, "--json", "/proc/x.json"),
-        ("export", result, "/proc/x"), ("demo", "--out", "/proc/x"),
+        ("export", result, "/proc/x"), ("demo", "--out", "/proc/x"), ("fleet", traverse, "--out", "/proc/x"),
+        ("desk", tmp_path / "x.rrd", "--out", "/proc"),
+        ("try", traverse, "--at", 0, "-p", "fast", "--set", "disparities=32", "-o", "/proc/x.rrd"),
         ("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--summary", "/proc/x.json"),
     ):  # fmt: skip
         printed = said(1, *command).err

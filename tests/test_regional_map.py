@@ -117,3 +117,9 @@ def test_an_impossible_export_is_refused_in_one_sentence(result, tmp_path, where
     log = tmp_path / "gone.mcap" if where == "gone" else result
     assert words in refused("export", log, tmp_path / where if where != "gone" else tmp_path / "maps")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_export_below_a_file_names_folder_and_reason(result, tmp_path, said):
+    (tmp_path / "file").write_text("mine")
+    folder = tmp_path / "file" / "maps"
+    assert f"cannot write {folder}: Not a directory; choose another place" in said(1, "export", result, folder).err

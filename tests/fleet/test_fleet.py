@@ -211,6 +211,13 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
     }  # fmt: skip
     with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix"):
         jobs_of([str(logs / "nix")], tmp_path)
+    (logs / "which.txt").write_text("nix.mcap\n")
+    with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix\.mcap, which .*which\.txt names"):
+        jobs_of([str(logs / "which.txt")], tmp_path)
+
+
+def test_a_file_is_no_folder_of_a_fleet(logs, refused):
+    assert "a.mcap is a file; give the name of a folder" in refused("fleet", logs / "b.mcap", "--out", logs / "a.mcap")
 
 
 @pytest.mark.slow

@@ -50,8 +50,8 @@ def run(options: argparse.Namespace) -> int:
         for part in [options.folder] if made else list(options.folder.iterdir()):
             if part.is_dir():
                 shutil.rmtree(part, ignore_errors=True)
-            else:
-                part.unlink(missing_ok=True)
+            elif part.exists():
+                part.unlink()
         raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")

@@ -12,6 +12,7 @@ from flow.cli.outputs import add_pipeline_options
 from flow.cli.report import say
 from flow.contracts import counted
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
+from recordings.atomic_write import writing
 
 if TYPE_CHECKING:
     from flow.cli.fleet.catalogue import Catalogue
@@ -51,10 +52,13 @@ def run(options: argparse.Namespace) -> int:
         return watch(Catalogue(options.out))
     if not options.logs:
         raise UsageError("give logs, folders, patterns or a text file of them")
+    if options.out.is_file():
+        raise UsageError(f"{options.out} is a file; give the name of a folder")
     load(options.pipeline, options.set)
     pipeline, folder = Pipeline.of(options.pipeline, tuple(options.set)), options.out.absolute()
     jobs = jobs_of(options.logs, folder, Catalogue(folder).rows() if (folder / NAME).is_file() else ())
-    folder.mkdir(parents=True, exist_ok=True)
+    with writing(options.out):
+        folder.mkdir(parents=True, exist_ok=True)
     catalogue = Catalogue(folder, create=True)
     with catalogue.held():
         _run_due(options, jobs, pipeline, catalogue)
