@@ -13,6 +13,7 @@ from distributed import Client
 from flow.cli.fleet.catalogue import Catalogue
 from flow.cli.fleet.engine import Fleet, cluster
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
+from flow.cli.fleet.page import write_fleet_page
 from flow.cli.fleet.progress import Progress
 from flow.cli.fleet.task import Pipeline, Task, run_task, unfit
 from flow.errors import UsageError
@@ -214,6 +215,16 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
     (logs / "which.txt").write_text("nix.mcap\n")
     with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix\.mcap, which .*which\.txt names"):
         jobs_of([str(logs / "which.txt")], tmp_path)
+
+
+def test_the_page_of_a_fleet_states_losses_and_findings_in_words(tmp_path):
+    findings = {"tilt": "note: 2 gaps.", "health": "fault: The sign is flipped."}
+    lossy = {"state": "done", "losses": {"unmatched": 4, "failed": 1}, "findings": findings}
+    Catalogue(tmp_path, create=True).put_all({"lossy": lossy, "sound": {"state": "done", "losses": {}, "findings": {}}})
+    write_fleet_page(tmp_path / "report.html", tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert "<td>4 unmatched, 1 failed</td><td>tilt: note: 2 gaps. health: fault: The sign is flipped.</td>" in page
+    assert "<td></td><td></td>" in page
 
 
 def test_a_file_is_no_folder_of_a_fleet(logs, refused):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -57,7 +58,11 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
     if column == "frames":
         return "" if row["frames"] is None else f"{row['complete']} of {row['frames']}"
     value = row[column]
-    return "" if value in (None, "{}") else f"{value:.1f}" if isinstance(value, float) else str(value)
+    if column == "losses":
+        return ", ".join(f"{number} {reason}" for reason, number in json.loads(value or "{}").items())
+    if column == "findings":
+        return " ".join(f"{stream}: {sentence}" for stream, sentence in json.loads(value or "{}").items())
+    return "" if value is None else f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
 def _mean(values: Sequence[float]) -> float:
