@@ -1,6 +1,6 @@
 """Two rectified images to a picture of the terrain: python two_images_to_dem.py left.png right.png dem.png
 
-The camera and its attitude are those of `roverflow simulate --size 640x480`; put yours there.
+The camera, its angle and its height are those of `roverflow simulate --size 640x480` on level ground: set yours.
 """
 
 import sys
