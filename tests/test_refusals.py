@@ -57,6 +57,7 @@ def test_a_file_of_another_format_is_refused_in_one_sentence(tmp_path, refused, 
     [
         ("disparity=96", "disparity.parameter=value; did you mean 'disparities'?"),
         ("rover.max_slope=95deg", "must be at most 89 deg, not 95deg"),
+        ("disparities=", "--set disparities=: write stream.parameter=value, or setting=value"),
         ("settings.disparities=64", "a setting has no prefix; write disparities=value"),
         ("disparity/half/quarter.search_radius=4", "quarter': Match.search_radius = 4 px needs a `prior`"),
     ],

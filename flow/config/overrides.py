@@ -23,11 +23,11 @@ class Change:
     @classmethod
     def read(cls, override: str) -> Change:
         """The change that `stream.parameter=value` or `setting=value` describes."""
-        path, separator, text = override.partition("=")
+        path, _, text = override.partition("=")
         names = path.strip().split(".")
         if names[0] == "sinks" and len(names) > 1:
             names = names[1:]
-        if not (separator and all(names)):
+        if not (text.strip() and all(names)):
             raise UsageError(f"--set {override}: write stream.parameter=value, or setting=value")
         value = read(text, lambda line: YamlLocation(f"--set {override}", None))
         return cls(names[0], tuple(names[1:]), value)
