@@ -65,7 +65,9 @@ def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_resul
     assert roverflow("run", log, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
     facts = json.loads(said(3, "diff", fast_result, out, "--json").out)["facts"]
     assert list(facts) == ["log_digest"]
-    assert facts["log_digest"][0] != facts["log_digest"][1]
+    one, other = facts["log_digest"]
+    assert one != other
+    assert f"log_digest: A {one} | B {other}\n" in said(3, "diff", fast_result, out).out
 
 
 def test_copied_inputs_are_counted_and_not_compared(traverse, fast_result, tmp_path, said):

@@ -77,5 +77,4 @@ def _copies(found: Diff) -> list[str]:
 
 
 def _shown(one: str, other: str) -> str:
-    parts = (" ".join(text.split()) or "-" for text in (one, other))
-    return " | ".join(parts)
+    return " | ".join(f"{name} {' '.join(text.split()) or '-'}" for name, text in (("A", one), ("B", other)))
