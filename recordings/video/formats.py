@@ -19,7 +19,7 @@ def unread_video(video_format: str) -> str:
     if video_format not in CODECS:
         return f"the video format '{video_format}' is not supported; record it in {' or '.join(CODECS)}"
     if find_spec("av") is None:
-        return "compressed video needs PyAV; install it by `pip install 'roverflow[video]'`"
+        return "compressed video needs PyAV; install it by `pip install '.[video]'` in roverflow's folder"
     return ""
 
 

@@ -185,7 +185,8 @@ def cluster(address: str | None, processes: int, cores: int, memory: str, dashbo
 
         from flow.cli.fleet.binding import CoreBinding
     except ImportError as error:
-        raise UsageError("a fleet needs dask.distributed; install roverflow[fleet]") from error
+        remedy = "install it by `pip install '.[fleet]'` in roverflow's folder"
+        raise UsageError(f"a fleet needs dask.distributed; {remedy}") from error
     for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # each has a level of its own
     dask.config.set(

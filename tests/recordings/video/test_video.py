@@ -76,7 +76,7 @@ def test_video_without_its_library_is_refused_with_the_remedy(sample, tmp_path, 
     with McapSource().open(log) as opened:
         assert (
             opened.missing["left"]
-            == f"{LEFT}: compressed video needs PyAV; install it by `pip install 'roverflow[video]'`"
+            == f"{LEFT}: compressed video needs PyAV; install it by `pip install '.[video]'` in roverflow's folder"
         )
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
     assert [line[:4] for line in project["optional-dependencies"]["video"]] == ["av>="]
