@@ -17,6 +17,7 @@ from tests.conftest import SMALL, rewrite, roverflow
 from tests.recordings.importers.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
+SET = "--set STREAM.PARAM=VALUE changes the pipeline"
 TAKEN = "exists and is no {} of roverflow; choose another name or remove it"
 
 
@@ -404,7 +405,8 @@ def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
         ("rnu a.mcap", "roverflow", "there is no command 'rnu'; did you mean 'run'?"),
         ("import kiti a", "roverflow", "there is no kind of import 'kiti'; did you mean 'kitti'?"),
         ("export a.mcap b --mpa x", "roverflow export", "unknown: --mpa x; did you mean '--map'?"),
-        ("run a b --dis 64", "roverflow run", "unknown: --dis 64; --set STREAM.PARAM=VALUE changes the pipeline"),
+        ("run a b --dis 64", "roverflow run", f"unknown: --dis 64; {SET}"),
+        ("try a --at 0 --set b.c=1 --disparities", "roverflow try", f"unknown: --disparities; {SET}"),
     ],
 )
 def test_an_unknown_name_is_answered_with_the_usage_and_the_nearest(command, usage, words, capsys):
@@ -412,7 +414,7 @@ def test_an_unknown_name_is_answered_with_the_usage_and_the_nearest(command, usa
         roverflow(*command.split())
     printed = capsys.readouterr().err
     assert printed.startswith(f"usage: {usage} [-h]")
-    assert f"\n{usage}: error: {words}" in printed
+    assert printed.endswith(f"\n{usage}: error: {words}\n")
 
 
 def test_an_unknown_pipeline_is_answered_with_templates_too(refused):

@@ -97,7 +97,8 @@ def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequenc
     """End the program with the usage of a command and the valid name nearest to `name`."""
     from flow.config.yaml_tree import nearest
 
-    parser.error(f"{why}{nearest(name, valid)}")
+    near = [each for each in valid if nearest(name.lstrip("-"), [each.lstrip("-")])]  # dashes make no names alike
+    parser.error(f"{why}{nearest(name, near)}")
 
 
 def _named(given: Sequence[str]) -> Iterator[tuple[str, str, Sequence[str]]]:
