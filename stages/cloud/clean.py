@@ -22,6 +22,7 @@ from stages.stage import Stage, parameter
 MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
 MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the ground's
 MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image
+KNN_QUERY = 1 << 16  # points whose nearest neighbours are in memory at once
 MIN_NEIGHBOURS = 4  # with fewer a point cannot be judged and is dropped
 
 
@@ -104,7 +105,10 @@ class Clean(Stage):
         near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= self._crop**2)
         if len(near) <= self.knn_neighbours:
             return near
-        distance, _ = cKDTree(points[near]).query(points[near], k=self.knn_neighbours + 1, workers=1)
-        mean = distance[:, 1:].mean(axis=1)
+        tree, mean = cKDTree(points[near]), np.empty(len(near))
+        for first in range(0, len(near), KNN_QUERY):
+            some = slice(first, first + KNN_QUERY)
+            distance, _ = tree.query(points[near[some]], k=self.knn_neighbours + 1, workers=1)
+            mean[some] = distance[:, 1:].mean(axis=1)
         kept: Array = near[mean <= mean.mean() + self.knn_max_deviations * mean.std()]
         return kept

@@ -67,6 +67,8 @@ class MatchOpenCV(Stage):
     )
     color: bool = parameter(False, "match on RGB instead of gray")
 
+    large = True  # StereoSGBM keeps the sums of all paths of the whole frame
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.block_size % 2 == 0:
