@@ -107,7 +107,10 @@ def test_what_cannot_be_explained_is_refused(traverse, fast_result, refused):
         (("--cell", "1,1"), "traverse.mcap, is not beside it; give it with --log"),
         (("--cell", "99,1", "--log", traverse), "is outside the map, which has x "),
         (("--pixel", "999,1", "--log", traverse), "is outside the image of 320x240"),
-        (("--cell", "1,1", "--log", traverse, "--map", "nix"), "has no navigation map 'nix', only navigation_map, reg"),
+        (
+            ("--cell", "1,1", "--log", traverse, "--map", "nix"),
+            "has no navigation map 'nix', only navigation_map, regional_navigation_map",
+        ),
     ):
         assert why_not in refused("why", fast_result, "--at", AT, *words)
 

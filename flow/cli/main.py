@@ -97,7 +97,7 @@ def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequenc
     """End the program with the usage of a command and the valid name nearest to `name`."""
     from flow.config.yaml_tree import nearest
 
-    near = [each for each in valid if nearest(name.lstrip("-"), [each.lstrip("-")])]  # dashes make no names alike
+    near = [each for each in valid if nearest(name.lstrip("-"), [each.lstrip("-")])]  # all options share the dashes
     parser.error(f"{why}{nearest(name, near)}")
 
 

@@ -27,7 +27,7 @@ def say(text: str) -> None:
 
 
 def duration(seconds: float) -> str:
-    """A time about as exact as an estimate is."""
+    """An estimated time in s, min or h, with no more digits than an estimate has."""
     if seconds >= 7200:
         return f"{seconds / 3600:.1f} h"
     return f"{seconds / 60:.0f} min" if seconds >= 120 else f"{seconds:.0f} s"

@@ -84,7 +84,8 @@ class _Outputs:
             kept = "".join(
                 f"; {self.paths[use]} contains the frames before it" for use in self.opened if use not in failed
             )
-            named = "" if str(self.paths[use]) in str(cause) else f" could not write {self.paths[use]}"
+            path = self.paths[use]
+            named = "" if str(cause).startswith(f"cannot write {path}: ") else f" could not write {path}"
             sentence = f"{use.rpartition('.')[2]}{named}: {cause}{kept}"
             raise SinkError(sentence, summary | {"verdict": str(Verdict.INCOMPLETE), "failure": sentence}) from cause
 

@@ -55,7 +55,8 @@ def find_files(given: Path | Sequence[Path]) -> FoundFiles:
 def first_bytes(path: Path, kind: str = "a log") -> bytes:
     """The first bytes of a file. kind: of the file, for the sentence. Raises LogError for what is none, or empty."""
     if path.exists() and not path.is_file():
-        raise LogError(f"{path} is {'a folder' if path.is_dir() else 'a pipe or a device'}; give {kind}")
+        what, where = ("a folder", " in it") if path.is_dir() else ("a pipe or a device", "")
+        raise LogError(f"{path} is {what}; give {kind}{where}")
     try:
         with path.open("rb") as file:
             start = file.read(16)

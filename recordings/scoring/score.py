@@ -281,7 +281,7 @@ class _Tally:
         return self.terrain.add(ground, fitting.get("/nav/elevation_map", {}), fitting.get("/nav/navigation_map"))
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
-        """The tilt's error, of a camera that the truth has; frame `level` may contain others, such as of pictures."""
+        """The tilt's error, by the camera that the truth knows. Viewers' pictures are children of frame `level` too."""
         placed = {item.child_frame_id.removeprefix(OWN_FRAME): item for item in frame.get("/tf", ())}
         true = frame["/truth/tilt"]
         body, true_up = true.header.frame_id, _rotation(true.quaternion)[2]  # up is in the axes of its header

@@ -27,7 +27,7 @@ TEXT_RGB: Rgb = (225, 228, 235)
 CAMERA_RGB: Rgb = (255, 210, 60)
 VEIL: tuple[int, int, int, int] = (96, 100, 112, 170)  # over guesses
 CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
-WHOLE_WIDTHS, MIN_SMALL_WIDTH = (320, 640), 160  # px, of pictures of results and of intermediates
+MIN_WHOLE_WIDTH, MAX_WHOLE_WIDTH, MIN_SMALL_WIDTH = 320, 640, 160  # px, of pictures of results; of intermediates
 LEGEND_COLUMNS = (4, 3)  # of a single row, and of several, which have the longer names
 VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
     cv2.COLORMAP_TURBO: rr.components.Colormap.Turbo,
@@ -131,8 +131,8 @@ class Canvas:
         """The widest picture of a result, px."""
         if self.max_width:
             return self.max_width
-        least, most = WHOLE_WIDTHS
-        return min(max(self.camera.width // 2, least), most) if self.camera else most
+        half = self.camera.width // 2 if self.camera else MAX_WHOLE_WIDTH
+        return min(max(half, MIN_WHOLE_WIDTH), MAX_WHOLE_WIDTH)
 
     @property
     def small_width(self) -> int:

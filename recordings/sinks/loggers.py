@@ -35,9 +35,9 @@ from stages.data import (
 )
 from stages.data.rotations import matrix_of
 
-# Drawn steps of a px, a px and a metre; the result log has the values as they are
+# Steps of drawn values: to a px of disparity, to a px of sigma, to a metre of depth; the result log has more digits
 DISPARITY_STEPS, SIGMA_STEPS, DEPTH_STEPS = 4, 250, 250
-POINT_STEPS = 512  # of a metre; a power of 2, so that the lower bits of the drawn points are 0
+POINT_STEPS = 512  # to a metre; a power of 2, so that the lower bits of the drawn points are 0
 ALL_CODES = np.arange(256, dtype=np.uint8)
 # Layer -> the upper end of its scale, twice the usual limit, and its unit
 LAYER_SCALES = {
@@ -171,7 +171,7 @@ def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
 
 
 def _steps(values: Array, per_unit: float) -> Array:
-    """Values (H, W) in whole steps, uint16; NaN and negative values become 0."""
+    """Values (H, W) in whole steps, uint16, at most 65535; NaN and negative values become 0."""
     steps: Array = cv2.multiply(np.ascontiguousarray(values), per_unit, dtype=cv2.CV_16U)  # type: ignore[call-overload]
     return steps
 

@@ -59,10 +59,10 @@ class Refine(Stage):
 
     A match that moves by at most 0.5 px and two sigmas stays MEASURED if the images correlate over its support and its
     sigma is small, else it becomes FILLED. A match that moves farther becomes PLANE. A hole that a plane fills is
-    PLANE, another filled hole FILLED, but either is MEASURED where both cameras see it and its support passes the same
-    tests. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that stays
-    unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or OUT_OF_VIEW. See
-    docs/refinement.md.
+    MEASURED if its support passes the same tests, else PLANE. Another filled hole must also be seen by both cameras,
+    else it is FILLED. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that
+    stays unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or
+    OUT_OF_VIEW. See docs/refinement.md.
 
     References
     ----------

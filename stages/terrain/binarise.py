@@ -88,7 +88,7 @@ class Binarise(Stage):
         height = elevation.layers["elevation"]
         observed = np.isfinite(height)
         if self.method == "absolute":
-            reason = self._sure(elevation)
+            reason = self._clear_or_unsure(elevation)
             reason[observed & (height > self.rover.max_step)] = CellReason.ELEVATION
         else:
             reason = self._rover_reasons(elevation, observed)
@@ -108,7 +108,7 @@ class Binarise(Stage):
         slope, steepness, roughness = (elevation.layers[name] for name in ("slope", "steepness", "roughness"))
         high, belly = self._obstacles(elevation, observed)
         limit = self.rover.max_slope + _SLOPE_ROUNDING
-        reason = self._sure(elevation)
+        reason = self._clear_or_unsure(elevation)
         reason[_dilated(high | belly, self.hazard_margin / elevation.resolution)] = CellReason.BESIDE
         reason[roughness > self.max_roughness] = CellReason.ROUGHNESS
         reason[(slope > limit) | (steepness > limit)] = CellReason.SLOPE
@@ -122,8 +122,8 @@ class Binarise(Stage):
         high = observed & (elevation.layers["step"] >= self.rover.max_step - self.height_margin)
         return high, observed & (above >= self.rover.ground_clearance - self.height_margin)
 
-    def _sure(self, elevation: ElevationMap) -> Array:
-        """CLEAR, or UNSURE for a doubt, (rows, cols)."""
+    def _clear_or_unsure(self, elevation: ElevationMap) -> Array:
+        """The reason of each cell without a hazard, (rows, cols): UNSURE where there is a doubt, else CLEAR."""
         unsure = np.logical_or.reduce([np.zeros(elevation.shape, bool), *self.doubts(elevation).values()])
         return np.where(unsure, CellReason.UNSURE, CellReason.CLEAR)
 

@@ -219,11 +219,12 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
 
 def test_the_page_of_a_fleet_states_losses_and_findings_in_words(tmp_path):
     findings = {"tilt": "note: 2 gaps.", "health": "fault: The sign is flipped."}
-    lossy = {"state": "done", "losses": {"unmatched": 4, "failed": 1}, "findings": findings}
-    Catalogue(tmp_path, create=True).put_all({"lossy": lossy, "sound": {"state": "done", "losses": {}, "findings": {}}})
+    lossy = {"state": "done", "findings": findings, "seconds": 2.0, "why": "4 unmatched, 1 failed"}
+    Catalogue(tmp_path, create=True).put_all({"lossy": lossy, "sound": {"state": "done", "findings": {}, "why": ""}})
     write_fleet_page(tmp_path / "report.html", tmp_path)
     page = (tmp_path / "report.html").read_text()
-    assert "<td>4 unmatched, 1 failed</td><td>tilt: note: 2 gaps. health: fault: The sign is flipped.</td>" in page
+    sentences = "tilt: note: 2 gaps. health: fault: The sign is flipped."
+    assert f"<td>{sentences}</td><td>2.0</td><td>4 unmatched, 1 failed</td>" in page
     assert "<td></td><td></td>" in page
 
 

@@ -37,22 +37,23 @@ def disparity(height: int = 60, width: int = 80, stamp: int = 7) -> Disparity:
     return Disparity(stamp, *(np.ones((height, width), kind) for kind in (np.float32, np.uint8, np.float32)))
 
 
-OF_BOTH = stages.Refine(), stages.RefinePaper(), stages.Reproject()
+OF_FRAME_AND_DISPARITY = stages.Refine(), stages.RefinePaper(), stages.Reproject()
 JOIN = "join the disparity with the rectified frame"
 TIMES = "frame of 7 ns, disparity of 8 ns: join data"
 
 
 @pytest.mark.parametrize(("stage", "inputs", "message"), [
     *((stage, (FRAME, disparity(30)), rf"{type(stage).__name__}: .* \(30, 80\), .*{JOIN}")
-      for stage in OF_BOTH),
+      for stage in OF_FRAME_AND_DISPARITY),
     *((stage, (RAW, disparity()), rf"put stages\.Rectify before stages\.{type(stage).__name__}")
-      for stage in OF_BOTH),
-    *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_BOTH[:2]),
+      for stage in OF_FRAME_AND_DISPARITY),
+    *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_FRAME_AND_DISPARITY[:2]),
     (Running(stages.VisualOdometry()), (FRAME, disparity(30)), JOIN),
     (stages.Upsample(), (FRAME, disparity(40, 66)), r"Upsample: .*\(40, 66\)"),
     (stages.Upsample(), (FRAME, disparity(30, 40, stamp=8)), f"Upsample: {TIMES}"),
     (stages.LeftRightCheck(), (disparity(), disparity(30)), "LeftRightCheck: .* at the same size"),
-    (stages.LeftRightCheck(), (disparity(), disparity(stamp=8)), "disparity of 7 ns, backward of 8 ns: join data"),
+    (stages.LeftRightCheck(), (disparity(), disparity(stamp=8)),
+     "LeftRightCheck: disparity of 7 ns, backward of 8 ns: join data"),
 ])  # fmt: skip
 def test_inputs_that_do_not_belong_together_are_refused(stage: Any, inputs: tuple[Any, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):

@@ -20,7 +20,7 @@ from recordings.sinks.overwrite import is_ours
 
 HELP = "simulate a short traverse, replay it and score it against ground truth"
 FIRST_FRAME = 0.6  # s of the traverse that contain one frame
-FRAME_MB = 15  # input log 10, result log 3.5, recording 1.5
+FRAME_MB = 15  # input log 10, result log 3.5, recording 1
 MAPS_MB = 3  # pictures and exported maps
 
 

@@ -16,7 +16,7 @@ from recordings.reporting.page import html_table, write_page
 from recordings.scoring.score import score
 from recordings.scoring.table import SCORES, brief_figures, brief_row
 
-_COLUMNS = ("name", "verdict", "frames", "losses", "findings", "seconds", "why")
+_COLUMNS = ("name", "verdict", "frames", "findings", "seconds", "why")
 
 
 def write_fleet_page(path: Path, folder: Path) -> None:
@@ -58,8 +58,6 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
     if column == "frames":
         return "" if row["frames"] is None else f"{row['complete']} of {row['frames']}"
     value = row[column]
-    if column == "losses":
-        return ", ".join(f"{number} {reason}" for reason, number in json.loads(value or "{}").items())
     if column == "findings":
         return " ".join(f"{stream}: {sentence}" for stream, sentence in json.loads(value or "{}").items())
     return "" if value is None else f"{value:.1f}" if isinstance(value, float) else str(value)

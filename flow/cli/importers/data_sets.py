@@ -19,8 +19,9 @@ FILES: dict[str, Any] = {"type": Path, "nargs": "+", "metavar": "FILE"}
 class DataSet:
     """A kind of recording, which `recordings.importers.KIND.read_KIND` reads.
 
-    source: what its folder contains; rig: what its rig file says; entries: that the rig file may have, by their names
-    in `recordings.importers.rig`; options: further ones, as argparse takes them, in the order in which they are read.
+    HELP: one line, named as in modules of commands; source: what its folder contains; rig: what its rig file says;
+    entries: that the rig file may have, by their names in `recordings.importers.rig`; options: further ones, as
+    argparse takes them, in the order in which they are read.
     """
 
     kind: str

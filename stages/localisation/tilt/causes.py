@@ -85,7 +85,7 @@ class Fit:
         return float(np.sum(np.square(self.normal - ups[self.known].mean(axis=0)))) / GROUND_SIGMA**2
 
     def cause(self, fault: str, remedy: str, ups: Array, parameters: int = 0, **more: Any) -> Cause:
-        """A fault without which up has the directions `ups` in the camera."""
+        """The cause `fault`, judged by the directions (n, 3) in the camera that up has once it is undone."""
         return Cause(fault, remedy, self.misfit(ups), self.slope(ups), parameters, **more)
 
 

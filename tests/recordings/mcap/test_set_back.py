@@ -7,7 +7,7 @@ import pytest
 
 from recordings import McapSource
 from recordings.containers.clock import MAX_JITTER_NS
-from tests.conftest import Row, rewrite
+from tests.conftest import Row, mcap_rows, rewrite
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essences, inventory_of, items_of, sound
 
 BACK = 23 * PERIOD // 10
@@ -107,7 +107,7 @@ def test_images_and_tilts_across_a_set_back_clock_are_not_joined(sample, tmp_pat
 
 @EVERY_LAYOUT
 def test_a_single_log_time_that_leaps_ahead_is_damage(sample, tmp_path, options):
-    one = START + PERIOD + 1000
+    one = next(row[3] for row in mcap_rows(sample) if row[0] == LEFT and row[3] > START + PERIOD)
 
     def ahead(topic, log_time):
         return log_time + (10**13 if (topic, log_time) == (LEFT, one) else 0)
