@@ -41,7 +41,8 @@ def cluster(port: int, modules: Path | None = None) -> Iterator[tuple[str, subpr
     worker = ("worker", address, "--nthreads", 1, "--host", "127.0.0.1", "--no-dashboard")
     started, environment = [], ENVIRONMENT
     if modules:
-        environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join((str(modules), ENVIRONMENT["PYTHONPATH"]))}
+        path = os.pathsep.join((str(modules), ENVIRONMENT["PYTHONPATH"]))
+        environment = {**ENVIRONMENT, "PYTHONPATH": path, "PYTHONSAFEPATH": "1"}  # else the folder of the run is first
     for words in (scheduler, worker, worker):
         command = [sys.executable, "-m", f"distributed.cli.dask_{words[0]}", *map(str, words[1:])]
         started.append(subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment))
