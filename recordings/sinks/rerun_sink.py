@@ -23,6 +23,8 @@ from stages.data import Mount, Region
 if TYPE_CHECKING:
     from recordings.sinks.rerun_recording import RerunRecording
 
+MIN_WIDTH = 8  # px, of a picture
+
 
 @dataclass(eq=False)
 class RerunSink:
@@ -67,6 +69,8 @@ class RerunSink:
 
     def __post_init__(self) -> None:
         check_parameters(self)
+        if 0 < self.max_width < MIN_WIDTH:
+            raise ValueError(f"RerunSink.max_width must be 0 or at least {MIN_WIDTH} px, not {self.max_width} px")
         self._recording: RerunRecording | None = None  # while it is open
 
     def wants(self, stream: str, kind: Any) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -50,8 +51,9 @@ def run(options: argparse.Namespace) -> int:
         for part in [options.folder] if made else list(options.folder.iterdir()):
             if part.is_dir():
                 shutil.rmtree(part, ignore_errors=True)
-            elif part.exists():
-                part.unlink()
+            else:
+                with suppress(OSError):  # the reason for the failure is the one to report
+                    part.unlink()
         raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")

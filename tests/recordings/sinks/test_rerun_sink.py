@@ -251,7 +251,7 @@ def test_every_type_with_a_logger_is_wanted():
     assert wanted == set(STREAMS.values())
 
 
-@pytest.mark.parametrize("settings", [{"max_points": 0}, {"jpeg_quality": 0}, {"jpeg_quality": 101}])
+@pytest.mark.parametrize("settings", [{"max_points": 0}, {"max_width": 7}, {"jpeg_quality": 0}, {"jpeg_quality": 101}])
 def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(ValueError, match=next(iter(settings))):
         RerunSink(**settings)  # type: ignore[arg-type]
