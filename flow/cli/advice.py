@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from recordings.source.settings import LogSettings
 
 # CPU seconds of a frame: at any size, and for each megapixel of the left image (`make bench`, docs/benchmarks.md)
-_SECONDS = {"fast": (0.15, 0.26), "rover": (0.15, 0.33), "accurate": (0.15, 0.55), "paper": (0.2, 3.8)}
+_SECONDS = {"fast": (0.15, 0.26), "rover": (0.15, 0.33), "accurate": (0.15, 0.55), "paper": (0.2, 4.8)}
 AMPLE = 1.5  # times the range that is enough, from which a smaller one is recommended
 _STARTING_SECONDS = 2.0  # before the first frame
 # Megabytes of a frame: at any size, and for each megapixel of the left image
