@@ -77,9 +77,9 @@ def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
     assert run_task(task) == row
     assert task.result.stat().st_mtime_ns == written
     assert reason_to_run(job, {**row, "result": row["result"]}, pipeline.digest, row["version"], tmp_path / "out") == ""
-    assert reason_to_run(job, row, "other", row["version"], tmp_path / "out") == "the pipeline changed"
+    assert reason_to_run(job, row, "other", row["version"], tmp_path / "out") == "of another pipeline"
     same = (pipeline.digest, row["version"], tmp_path / "out", True)
-    assert reason_to_run(job, row, *same) == "its recording is missing"
+    assert reason_to_run(job, row, *same) == "without its recording"
     assert run_task(replace(task, recording=True))["result"] == "a-nav.mcap"
     assert reason_to_run(job, row, *same) == ""
     broken = run_task(replace(task, job=replace(job, name="junk", log=logs / "junk.mcap")))
@@ -102,7 +102,7 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, s
         "a": "done", "b": "done", "site/c": "done", "junk": "unusable"
     }  # fmt: skip
     (out / "a-nav.mcap").unlink()
-    assert "4 logs: 3 done before, 1 to run (1 its result is missing)" in said(3, *words).out
+    assert "4 logs: 3 done before, 1 to run (1 without its result)" in said(3, *words).out
     assert (out / "a-nav.mcap").is_file()
     listed = said(0, "list", out, "--where", "verdict = 'COMPLETE'", "--sort", "frames DESC", "--json").out
     assert json.loads(listed)[0]["name"] == "b"
@@ -215,6 +215,11 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
     (logs / "which.txt").write_text("nix.mcap\n")
     with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix\.mcap, which .*which\.txt names"):
         jobs_of([str(logs / "which.txt")], tmp_path)
+
+
+def test_results_of_logs_above_the_working_folder_stay_in_the_folder_of_the_fleet(logs, tmp_path, monkeypatch):
+    monkeypatch.chdir(logs / "site")
+    assert [job.name for job in jobs_of(["c.mcap", "../a.mcap"], tmp_path)] == ["a", "site/c"]
 
 
 def test_the_page_of_a_fleet_states_losses_and_findings_in_words(tmp_path):

@@ -32,7 +32,8 @@ def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, An
     A folder that is one recording is one job. A log of the catalogue's rows keeps its name, whatever else is given.
     Raises UsageError if there is no log, or if a log has the name of another one.
     """
-    logs = list(dict.fromkeys(path.absolute() for word in given for path in _logs(word, folder)))
+    found = (path for word in given for path in _logs(word, folder))
+    logs = list(dict.fromkeys(path.resolve() if ".." in path.parts else path.absolute() for path in found))
     if not logs:
         raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, patterns or a text file of them")
     root = Path(os.path.commonpath([log.parent for log in logs]))
@@ -62,17 +63,17 @@ def reason_to_run(
     if row is None or not row["state"]:
         return "new"
     if row["log_digest"] != job.digest:
-        return "the log changed"
+        return "changed"
     if row["pipeline_digest"] != pipeline_digest:
-        return "the pipeline changed"
+        return "of another pipeline"
     if row["version"] != version:
-        return "another version of roverflow"
+        return "of another version of roverflow"
     if row["state"] not in ENDED:
-        return "it failed" if row["state"] == "failed" else "it was not finished"
+        return "failed before" if row["state"] == "failed" else "not finished"
     if row["state"] == "done" and row["result"] and not (folder / row["result"]).is_file():
-        return "its result is missing"
+        return "without its result"
     if recording and row["result"] and not (folder / row["result"]).with_suffix(".rrd").is_file():
-        return "its recording is missing"
+        return "without its recording"
     return ""
 
 

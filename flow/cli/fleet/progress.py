@@ -63,8 +63,8 @@ class Progress(AbstractContextManager["Progress"]):
         line = f"{self._ended} of {self._all}: {name}: {line_of(row)}"
         if left := self._bytes_left():
             seconds = (time.monotonic() - self._begun) * left / max(self._size - left, 1)
-            frames = self._frames + sum(self._running.values())
-            line += f"; {frames} frames so far, {left / 1e9:.2f} GB left, about {duration(seconds)}"
+            frames = counted(self._frames + sum(self._running.values()), "frame")
+            line += f"; {frames} so far, {left / 1e9:.2f} GB left, about {duration(seconds)}"
         self.say(line)
 
     def _bytes_left(self) -> float:
