@@ -15,7 +15,7 @@ from flow.cli.fleet.engine import Fleet, cluster
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
 from flow.cli.fleet.page import write_fleet_page
 from flow.cli.fleet.progress import Progress
-from flow.cli.fleet.task import Pipeline, Task, run_task, unfit
+from flow.cli.fleet.task import Pipeline, Task, _columns, run_task, unfit
 from flow.errors import UsageError
 from recordings.simulator import Simulation, write_log
 from tests.conftest import roverflow
@@ -107,7 +107,7 @@ def test_a_fleet_writes_what_run_writes_and_runs_nothing_twice(logs, tmp_path, s
     listed = said(0, "list", out, "--where", "verdict = 'COMPLETE'", "--sort", "frames DESC", "--json").out
     assert json.loads(listed)[0]["name"] == "b"
     table = said(0, "score", out).out.splitlines()
-    assert [line.split()[0] for line in table] == ["fast", "log", "a", "b", "site/c", "mean"]
+    assert [line.split()[0] for line in table] == ["fast", "log", "a", "b", "site/c", "mean", "not"]
     assert json.loads(rows_of(out)["a"]["scores"])["density"] > 0
     assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in said(0, "fleet", "--out", out, "--watch").out
     listed = said(0, "list", out, "--where", "verdict != 'COMPLETE'", "--csv").out
@@ -222,15 +222,41 @@ def test_results_of_logs_above_the_working_folder_stay_in_the_folder_of_the_flee
     assert [job.name for job in jobs_of(["c.mcap", "../a.mcap"], tmp_path)] == ["a", "site/c"]
 
 
+def test_a_row_names_the_faults_and_the_first_loss_of_a_run():
+    zero = dict.fromkeys(("frames_in", "frames_out", "wall_seconds", "cpu_seconds", "survey_cpu_seconds"), 0)
+    fault = {"rectified": {"severity": "fault", "sentence": "left and right are swapped"}}
+    lost = [{"stream": "left", "detail": "no partner"}, {"stream": "right", "detail": "cut"}]
+    summary = {"verdict": "INCOMPLETE", "interrupted": False, "surveys": fault, "findings": {}, "cpu_seconds_of": {}}
+    summary |= {"drops": {"unmatched": 1, "unreadable": 1}, "ledger": lost, "outputs": []} | zero
+    row = _columns(summary)
+    first = "1 unmatched, 1 unreadable, first: left: no partner"
+    assert row["why"] == f"rectified: left and right are swapped; {first}"
+    assert row["findings"] == {"rectified": "fault: left and right are swapped"}
+    assert _columns(summary | {"surveys": {}})["why"] == first
+
+
+def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs, tmp_path, said, refused):
+    (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
+    row = run_task(Task(job, tmp_path, Pipeline.of("fast", ("disparities=48",)), False, workers=2))
+    here = {"log": str(job.log), "pipeline": "fast"}
+    Catalogue(tmp_path, create=True).put_all({"a": row | here, "junk": here | {"state": "unusable"}})
+    assert "no truth: junk" in said(0, "score", tmp_path, "--json", tmp_path / "scores.json").out
+    figures = json.loads((tmp_path / "scores.json").read_text())["fast"]["a"]
+    assert figures["disparity"]["density"] == json.loads(rows_of(tmp_path)["a"]["scores"])["density"]
+    assert "--truth is for one result log" in refused("score", tmp_path, "--truth", job.log)
+
+
 def test_the_page_of_a_fleet_states_losses_and_findings_in_words(tmp_path):
     findings = {"tilt": "note: 2 gaps.", "health": "fault: The sign is flipped."}
+    sound = {"state": "done", "verdict": "COMPLETE", "findings": {}, "why": ""}
     lossy = {"state": "done", "findings": findings, "seconds": 2.0, "why": "4 unmatched, 1 failed"}
-    Catalogue(tmp_path, create=True).put_all({"lossy": lossy, "sound": {"state": "done", "findings": {}, "why": ""}})
+    Catalogue(tmp_path, create=True).put_all({"lossy": lossy | {"verdict": "INCOMPLETE"}, "sound": sound})
     write_fleet_page(tmp_path / "report.html", tmp_path)
     page = (tmp_path / "report.html").read_text()
     sentences = "tilt: note: 2 gaps. health: fault: The sign is flipped."
     assert f"<td>{sentences}</td><td>2.0</td><td>4 unmatched, 1 failed</td>" in page
     assert "<td></td><td></td>" in page
+    assert page.index("<td>lossy</td>") < page.index("<td>sound</td>")
 
 
 def test_a_file_is_no_folder_of_a_fleet(logs, refused):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 from flow.cli.outputs import check_outputs, write_text
 from flow.cli.report import say
-from flow.errors import COMPLETE, INCOMPLETE
+from flow.errors import COMPLETE, INCOMPLETE, UsageError
 
 HELP = "errors of a result log, or of the logs of a fleet, against ground truth"
 
@@ -21,7 +22,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Print the score."""
     if options.result.is_dir():
-        return _score_fleet(options.result)
+        return _score_fleet(options)
     from recordings.scoring.score import score
     from recordings.scoring.table import format_score
 
@@ -33,15 +34,20 @@ def run(options: argparse.Namespace) -> int:
     return INCOMPLETE if result.lost or result.unscored else COMPLETE
 
 
-def _score_fleet(folder: Path) -> int:
+def _score_fleet(options: argparse.Namespace) -> int:
     """Print a table for each pipeline of a fleet."""
     from flow.cli.fleet.catalogue import as_table
-    from flow.cli.fleet.page import score_rows
+    from flow.cli.fleet.page import score_logs, score_rows
     from recordings.scoring.table import SCORES
 
-    tables = score_rows(folder)
-    for pipeline, rows in tables.items():
-        say(f"{pipeline}\n{as_table([dict(zip(SCORES, row, strict=True)) for row in rows], SCORES)}")
-    if not tables:
-        say("no log of the fleet has both a result and truth")
+    if options.truth:
+        raise UsageError("--truth is for one result log; the truth of a fleet is that in its logs")
+    check_outputs({"score": options.json})
+    scores, others = score_logs(options.result)
+    figures = {name: {log: json.loads(found.to_json()) for log, found in logs.items()} for name, logs in scores.items()}
+    write_text(options.json, json.dumps(figures, indent=2))
+    for pipeline, logs in scores.items():
+        say(f"{pipeline}\n{as_table([dict(zip(SCORES, row, strict=True)) for row in score_rows(logs)], SCORES)}")
+    if others:
+        say(f"not scored, as they have no result or no truth: {', '.join(others)}")
     return COMPLETE

@@ -165,7 +165,7 @@ class Fleet:
 def _waiting(task: Task) -> dict[str, Any]:
     """The row of a log that waits."""
     row = WAITING | task.identity()
-    return row | {"log": str(task.job.log), "bytes": task.job.size, "pipeline": task.pipeline.name}
+    return row | {"log": str(task.job.log), "bytes": task.job.size, "pipeline": task.pipeline.label}
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from flow.cli.fleet.catalogue import NAME, Catalogue
 from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.reporting.page import html_table, write_page
-from recordings.scoring.score import score
+from recordings.scoring.score import Score, score
 from recordings.scoring.table import SCORES, brief_figures, brief_row
 
 _COLUMNS = ("name", "verdict", "frames", "findings", "seconds", "why")
@@ -21,7 +21,7 @@ _COLUMNS = ("name", "verdict", "frames", "findings", "seconds", "why")
 
 def write_fleet_page(path: Path, folder: Path) -> None:
     """Write the page of a fleet's folder: verdicts, times, losses and findings of every log."""
-    rows = Catalogue(folder).rows(sort="state, verdict, name")
+    rows = Catalogue(folder).rows(sort="verdict = 'COMPLETE', state, name")
     ended = Counter(str(row["verdict"] if row["state"] == "done" else row["state"]) for row in rows)
     hours = sum(row["seconds"] or 0.0 for row in rows) / 3600
     gigabytes = sum(row["bytes"] or 0 for row in rows) / 1e9
@@ -32,24 +32,30 @@ def write_fleet_page(path: Path, folder: Path) -> None:
     write_page(path, folder.resolve().name, [about, f"<h2>Logs</h2>{html_table(cells, _COLUMNS)}"])
 
 
-def score_rows(folder: Path) -> dict[str, list[tuple[str, ...]]]:
-    """Pipeline -> rows of `SCORES` of the logs that have truth, and their mean; the catalogue keeps the scores."""
-    by_pipeline = dict[str, list[tuple[str, list[float]]]]()
+def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], list[str]]:
+    """Pipeline -> log -> score, and the logs without a result or truth; the catalogue keeps the scores."""
+    scores, others = dict[str, dict[str, Score]](), list[str]()
     catalogue = Catalogue(folder, create=(folder / NAME).is_file())
-    for row in catalogue.rows("state = 'done' AND result IS NOT NULL"):
+    for row in catalogue.rows():
         try:
+            if row["state"] != "done" or row["result"] is None:
+                raise LogError("no result")
             found = score(folder / row["result"], Path(row["log"]))
         except LogError:  # the log has no truth, or is gone
+            others.append(row["name"])
             continue
-        figures = brief_figures(found)
-        known = {name: value for name, value in zip(SCORES[1:], figures, strict=True) if not math.isnan(value)}
+        known = {name: value for name, value in zip(SCORES[1:], brief_figures(found), strict=True) if value == value}
         catalogue.put(row["name"], {"scores": known})
-        by_pipeline.setdefault(row["pipeline"], []).append((row["name"], figures))
-    table = {}
-    for pipeline, logs in by_pipeline.items():
-        mean = [_mean([values[place] for _, values in logs]) for place in range(len(SCORES) - 1)]
-        table[pipeline] = [brief_row(name, values) for name, values in [*logs, ("mean", mean)]]
-    return table
+        scores.setdefault(row["pipeline"], {})[row["name"]] = found
+    return scores, others
+
+
+def score_rows(scores: Mapping[str, Score]) -> list[tuple[str, ...]]:
+    """Rows of `SCORES` of logs, and of their mean."""
+    figures = {name: brief_figures(found) for name, found in scores.items()}
+    figures["mean"] = [_mean(values) for values in zip(*figures.values(), strict=True)]
+    rows = [brief_row(name, values) for name, values in figures.items()]
+    return [tuple("-" if cell.startswith("nan") else cell for cell in row) for row in rows]
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:

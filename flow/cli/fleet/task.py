@@ -18,8 +18,9 @@ from typing import Any
 from flow.cli.fleet.jobs import Job
 from flow.cli.replay import product_version, replay
 from flow.config.loader import SHIPPED, load, shipped
-from flow.contracts import Verdict
+from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, UsageError
+from flow.runtime.findings import lines
 from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
 
@@ -46,6 +47,11 @@ class Pipeline:
         beside = [path, *(file for pattern in ("*.py", "*.yaml") for file in sorted(path.parent.glob(pattern)))]
         small = {file.name: file.read_bytes() for file in beside if file.stat().st_size <= MAX_FILE_BYTES}
         return cls(path.name, small, changes)
+
+    @property
+    def label(self) -> str:
+        """Its name and changes."""
+        return " ".join([self.name, *self.changes])
 
     @property
     def digest(self) -> str:
@@ -160,17 +166,25 @@ def _run(task: Task) -> dict[str, Any]:
 
 def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
     """The row of a summary."""
-    drops = ", ".join(f"{number} {reason}" for reason, number in summary["drops"].items())
-    faults = {name: f"{item['severity']}: {item['sentence']}" for name, item in summary["findings"].items()}
-    interrupted = summary["interrupted"]
+    found, interrupted = summary["surveys"] | summary["findings"], summary["interrupted"]
     return {
         "state": "failed" if interrupted else "done", "verdict": summary["verdict"], "frames": summary["frames_in"],
-        "complete": summary["frames_out"], "losses": summary["drops"], "findings": faults,
+        "complete": summary["frames_out"], "losses": summary["drops"],
+        "findings": {name: f"{item['severity']}: {item['sentence']}" for name, item in found.items()},
         "seconds": summary["wall_seconds"], "cpu_seconds": summary["cpu_seconds"],
         "stage_seconds": sum(summary["cpu_seconds_of"].values()) + summary["survey_cpu_seconds"],
-        "why": "" if summary["verdict"] == Verdict.COMPLETE else drops,
+        "why": _why(summary, found),
         "result": Path(summary["outputs"][0]).name if summary["outputs"] else None,
     }  # fmt: skip
+
+
+def _why(summary: Mapping[str, Any], found: Mapping[str, Mapping[str, str]]) -> str:
+    """Why a run is incomplete: its faults, the counts of its losses and the first of them; empty if it is complete."""
+    if summary["verdict"] == Verdict.COMPLETE:
+        return ""
+    drops = ", ".join(f"{number} {reason}" for reason, number in summary["drops"].items())
+    first = [f"{drops}, first: {entry['stream']}: {entry['detail']}" for entry in summary["ledger"][:1]]
+    return "; ".join([*lines(found, Severity.FAULT), *first])
 
 
 def _finished(task: Task) -> dict[str, Any] | None:
