@@ -140,7 +140,8 @@ class Log(Protocol):
 
     missing: stream -> why this log does not have it; refused: setting of the source -> why this log cannot be read with
     it; frames: the number of frames, where it is known. Optional: `begin`, the log time of its first message, ns;
-    `faults()`, stream -> a Finding about it, which the run asks for at its end.
+    `first_stamp`, the same on the clock of the stamps; `faults()`, stream -> a Finding about it, which the run asks for
+    at its end.
     """
 
     missing: Mapping[str, str]

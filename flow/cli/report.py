@@ -73,7 +73,8 @@ def report(summary: dict[str, Any]) -> None:
         say(f"  {line}")
     for reason, number in summary["drops"].items():
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
-        place = f"{first['stream']} at {_moment(first['stamp'], summary.get('log_begin'))}"
+        begin = summary.get("log_begin" if reason == LossReason.UNREADABLE else "first_stamp")  # log times, stamps
+        place = f"{first['stream']} at {_moment(first['stamp'], begin)}"
         say(f"  {number} {reason}, first: {place}: {first['detail']}")
     if line := bottleneck_line(summary["bottleneck"]):
         say(f"  {line}")

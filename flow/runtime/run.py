@@ -173,6 +173,7 @@ def run(
             "interrupted": stop.finishing(),
             "pipeline": graph.name,
             "log_begin": getattr(log, "begin", None),
+            "first_stamp": getattr(log, "first_stamp", None),
             "every": str(every),
             "frames_left_out": selection.left_out,
             **_counts(assembler, engine, ledger, times),

@@ -21,13 +21,11 @@ from numpy.typing import NDArray
 from flow.contracts import Finding, Severity
 from recordings.containers.clock import MAX_JITTER_NS
 from recordings.containers.container import LostMessage, RawMessage
-from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
 from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInRange, TimeRange
-from recordings.discovery.roles import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
-from recordings.ros2.from_msg import pose_of, stamp_of
+from recordings.ros2.from_msg import pose_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory, ImageReading
 from recordings.source.mount import pose_of_base
 from recordings.source.moving_mount import MovingMount
@@ -45,7 +43,6 @@ MAX_CALIBRATION_LAG_NS = 100_000_000  # a calibration may be logged this much la
 MAX_TRANSFORM_LAG_NS = 500_000_000  # the transforms of a moving camera may be this much later
 _MAX_KEY_INTERVAL = 1000  # frames before a range in which the key frame of a video is searched
 EXCERPT_FRAMES = 4  # so that an excerpt survives a broken frame
-STAMPED_SCHEMAS = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 UNSTAMPED = "the header stamps are 0, so log times are used"
 STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
 
@@ -85,6 +82,11 @@ class McapLog:
     def begin(self) -> int:
         """The log time of the first message, ns."""
         return self.file.start
+
+    @property
+    def first_stamp(self) -> int:
+        """The log time of the first message, on the clock of the left images' stamps, ns."""
+        return self.begin + self.resolution.messages.ahead_of(self.topics.get("left", ""))
 
     @property
     def frames(self) -> int | None:
@@ -238,7 +240,8 @@ class McapLog:
 
     def notes(self) -> dict[str, str]:
         """Stream -> note: missing stamps, the source of the baseline, an unknown base frame."""
-        notes = [(stream, UNSTAMPED) for stream, topic in self.topics.items() if self._is_unstamped(stream, topic)]
+        messages = self.resolution.messages
+        notes = [(stream, UNSTAMPED) for stream, topic in self.topics.items() if messages.is_unstamped(topic)]
         if any(self._schema(side) == VIDEO for side in CAMERAS):
             notes.append(("left", VIDEO_NOTE))
         notes += self.resolution.notes(self._estimator)
@@ -256,19 +259,9 @@ class McapLog:
             found["inclinometer"] = fault
         return found
 
-    def _is_unstamped(self, stream: str, topic: str) -> bool:
-        raws = (raw for raw in self.file.messages(self.channels(stream)) if not isinstance(raw, LostMessage))
-        first = next(raws, None) if self.resolution.messages.schemas[topic] in STAMPED_SCHEMAS else None
-        return first is not None and len(first.data) >= 12 and not self.stamp_of(first)
-
     def stamp_of(self, raw: RawMessage) -> int:
         """The header stamp of a message, ns; 0 if there is none."""
-        encoding = self.file.channels[raw.channel].message_encoding
-        if encoding in ("cdr", "ros1"):
-            return peek_stamp(raw.data, encoding)
-        decoder = self.resolution.messages.decoders[raw.channel]
-        stamp = attempt(lambda: stamp_of(decoder(raw.data).header))
-        return 0 if isinstance(stamp, LogError) else stamp
+        return self.resolution.messages.stamp_of(raw)
 
     def channels(self, stream: str) -> set[int]:
         """The channels of a stream."""
@@ -377,7 +370,8 @@ class McapLog:
         messages = self.resolution.messages
         decoders = {number: messages.decoders[number] for number in messages.channels_of(topic)}
         pixels_of = item.pixels_of if isinstance(item, ImageReading) else None
-        return TopicReader(stream, topic, decoders, item, pixels_of if isinstance(pixels_of, VideoDecoder) else None)
+        made = (lambda message, _: item(message, 0)) if messages.ahead_of(topic) else item  # a stamp of 0 is one
+        return TopicReader(stream, topic, decoders, made, pixels_of if isinstance(pixels_of, VideoDecoder) else None)
 
     def _schema(self, stream: str) -> str:
         """The full name of the type of a stream's messages, or an empty string."""

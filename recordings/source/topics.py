@@ -15,14 +15,18 @@ from typing import Any, TypeVar
 import numpy as np
 
 from recordings.containers.container import LostMessage, MessageSchema, RawMessage
+from recordings.containers.header import peek_stamp
 from recordings.containers.recording import Recording
+from recordings.containers.time_range import MAX_LATENESS_NS
+from recordings.discovery.roles import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.encodings.decoding import MAX_SCHEMA_BYTES, Decoder, decoder_of, weight_of
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import Unpacking
-from recordings.ros2.from_msg import frame_of
+from recordings.ros2.from_msg import frame_of, stamp_of
 from recordings.video.decoder import PixelReader, VideoDecoder, begins_video, reader_of
 
 MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
+STAMPED_SCHEMAS = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 _RATE_SECONDS = 10  # over which the rate of a topic is a mean, as recorders write late messages in bursts
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
@@ -117,6 +121,28 @@ class DecodedTopics:
     def count(self, topic: str) -> int:
         """The number of messages of a topic in decodable channels."""
         return self.file.count(self.channels_of(topic))
+
+    def stamp_of(self, raw: RawMessage) -> int:
+        """The header stamp of a message, ns; 0 if there is none."""
+        encoding = self.file.channels[raw.channel].message_encoding
+        if encoding in ("cdr", "ros1"):
+            return peek_stamp(raw.data, encoding)
+        stamp = attempt(lambda: stamp_of(self.decoders[raw.channel](raw.data).header))
+        return 0 if isinstance(stamp, LogError) else stamp
+
+    def ahead_of(self, topic: str) -> int:
+        """How far the last stamp of a topic is ahead of its log time, ns, where they are of two clocks; else 0."""
+        times = self.file.times(self.channels_of(topic)) if self.schemas.get(topic) in STAMPED_SCHEMAS else np.zeros(0)
+        raws = self.file.messages(self.channels_of(topic), int(times.max())) if len(times) else iter(())
+        last = next((raw for raw in raws if isinstance(raw, RawMessage)), None)
+        stamp = self.stamp_of(last) if last is not None else 0
+        return stamp - last.log_time if last and stamp and abs(stamp - last.log_time) > MAX_LATENESS_NS else 0
+
+    def is_unstamped(self, topic: str) -> bool:
+        """Whether the header stamps of a topic are 0 and not those of a clock that begins there."""
+        raws = (raw for raw in self.file.messages(self.channels_of(topic)) if isinstance(raw, RawMessage))
+        first = next(raws, None) if self.schemas[topic] in STAMPED_SCHEMAS else None
+        return first is not None and len(first.data) >= 12 and not (self.stamp_of(first) or self.ahead_of(topic))
 
     def each(
         self, topic: str, make: Callable[[Any], T], start: int | None = None, allow_repeats: bool = False

@@ -3,7 +3,7 @@
 import pytest
 
 from flow.cli.report import headline, report
-from flow.contracts import Finding, Severity
+from flow.contracts import Finding, LossReason, Severity
 from flow.runtime.findings import checked, explained
 from tests.flow.toys import graph, replayed, traverse
 
@@ -26,6 +26,17 @@ def test_a_fault_makes_the_verdict_incomplete_and_is_printed_last(tmp_path, caps
     verdict, *more = printed(tmp_path, 7, capsys)
     assert verdict.startswith("INCOMPLETE: 7 frames complete, fault reported by total")
     assert more == ["FAULT: total: the sum is 42.0"]
+
+
+def test_the_time_of_the_first_loss_is_that_of_start_also_with_stamps_of_another_clock(tmp_path, capsys):
+    _, summary = replayed(graph(tmp_path), traverse(5))
+    lost = [{"reason": reason, "stream": "left", "stamp": 9_500_000_000, "detail": "why"} for reason in LossReason]
+    drops = dict.fromkeys(("unreadable", "unmatched"), 1)
+    clocks = {"log_begin": 9_000_000_000, "first_stamp": 2_000_000_000}
+    report(summary | clocks | {"outputs": [], "bottleneck": {}, "drops": drops, "ledger": lost})
+    printed = capsys.readouterr().out
+    assert "1 unreadable, first: left at +0.5 s (9500000000 ns): why" in printed
+    assert "1 unmatched, first: left at +7.5 s (9500000000 ns): why" in printed
 
 
 def test_a_warning_that_assumes_what_has_a_fault_becomes_a_note():
