@@ -121,7 +121,10 @@ def class_at(use: str, place: YamlLocation) -> type:
         where = f"beside {place.file}" if place.line else "in the folder"
         raise place.error(f"there is no module '{error.name}' {where} or on the Python path") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
-        raise place.error(f"cannot import '{module_name}': {type(error).__name__}: {error}") from error
+        trace = error.__traceback__
+        while trace is not None and trace.tb_frame.f_code.co_name != "<module>":  # of the import itself
+            trace = trace.tb_next
+        raise place.error(f"cannot import '{module_name}': {failure(error.with_traceback(trace))}") from error
     kind = getattr(module, name, None)
     if isinstance(kind, type) and is_dataclass(kind):
         return kind

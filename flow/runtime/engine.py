@@ -30,7 +30,7 @@ from typing import Any
 
 from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink, Unchanged
 from flow.runtime.bottleneck import READING, bottleneck
-from flow.runtime.graph import Node, is_item, start
+from flow.runtime.graph import Node, start
 from flow.runtime.ledger import Ledger, failure
 
 _NO_ITEM = (Absent, Unchanged)
@@ -353,8 +353,7 @@ class Engine:
                 value = node.actor.flush(**state)
             if value is None and (missing or node.sparse):
                 return missing or Unchanged()
-            if not is_item(value, node.output):
-                raise TypeError(f"{node.use} returned {type(value).__name__}, not {node.output.__name__}")
+            node.check(value, given.values(), frame.stamp)
             return value
 
         large = bool(getattr(node.actor, "large", False))

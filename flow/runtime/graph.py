@@ -14,7 +14,7 @@ from numbers import Real
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from flow.contracts import Sink, unaliased
+from flow.contracts import Sink, StageError, unaliased
 from flow.errors import PipelineError
 from flow.runtime.ledger import failure
 
@@ -71,6 +71,14 @@ class Node:
     def sparse(self) -> bool:
         """Whether the actor is a stage that may return None, where a frame has nothing new."""
         return not self.aligns and NoneType in get_args(_returned(type(self.actor)))
+
+    def check(self, value: Any, given: Iterable[Any], stamp: int) -> None:
+        """Refuse a result of another type, or with a stamp of neither the frame nor an input. A flush may be older."""
+        if not is_item(value, self.output):
+            raise TypeError(f"{self.use} returned {type(value).__name__}, not {self.output.__name__}")
+        stamps = {stamp, None, *(getattr(item, "stamp", None) for item in given)}
+        if getattr(value, "stamp", None) not in stamps and not hasattr(self.actor, "flush"):
+            raise StageError(f"{self.use} returned the stamp {value.stamp} ns, not that of its frame")
 
 
 @dataclass(frozen=True)

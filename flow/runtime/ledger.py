@@ -27,7 +27,7 @@ def failure(error: BaseException) -> str:
     # The last line in the file of the stage itself: what its libraries do further down means little to a user.
     own = [call for call in outside if call.filename == outside[0].filename]
     where = f" ({Path(own[-1].filename).name}, line {own[-1].lineno}; --debug shows the traceback)" if own else ""
-    return f"{type(error).__name__}: {error}{where}"
+    return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
 
 
 class Ledger:

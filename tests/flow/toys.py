@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -141,6 +141,12 @@ class Mute:
 class Liar:
     def __call__(self, couple: Couple) -> Couple:
         return Text(couple.stamp, "not a couple")  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Late:
+    def __call__(self, couple: Couple) -> Couple:
+        return replace(couple, stamp=couple.stamp + 1)
 
 
 class Meter:

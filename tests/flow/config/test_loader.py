@@ -255,7 +255,8 @@ def own(field="int", takes="couple: Couple", returns="Couple"):
 
 
 @pytest.mark.parametrize(("source", "replaced", "entry", "message"), [
-    ("1 / 0\n", SCALE, "Own", "5: cannot import 'MODULE': ZeroDivisionError"),
+    ("1 / 0\n", SCALE, "Own",
+     "5: cannot import 'MODULE': ZeroDivisionError: division by zero (MODULE.py, line 1; --debug"),
     ("import sys\nsys.exit(3)\n", SCALE, "Own", "5: cannot import 'MODULE': SystemExit: 3"),
     (own(field="list[Nix]"), SCALE, "Own, couple: both",
      "5: the annotations of Own cannot be read: name 'Nix' is not defined"),

@@ -78,6 +78,13 @@ def test_a_result_of_the_wrong_type_fails_the_frame_not_the_run(tmp_path):
     assert "returned Text, not Couple" in summary["ledger"][0]["detail"]
 
 
+def test_a_result_with_another_stamp_fails_the_frame_not_the_run(tmp_path):
+    text = PIPELINE.replace("tests.flow.toys.Add, a: sum, b: height", "tests.flow.toys.Late, couple: sum")
+    _, summary = replayed(graph(tmp_path, text=text), traverse(2))
+    assert summary["drops"] == {"failed": 2}
+    assert summary["ledger"][0]["detail"] == "tests.flow.toys.Late returned the stamp 1 ns, not that of its frame"
+
+
 def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
     pipeline = graph(tmp_path, fail_at=5)
     ((_, sink),) = pipeline.sinks
