@@ -8,11 +8,12 @@ from flow.contracts import counted
 from recordings.comparison.diff import Diff, TopicDiff
 
 _LAYER = "cells of layer "
+_MAX_LINES = 10  # of a pipeline, in a terminal
 
 
 def format_diff(found: Diff) -> str:
     """The difference for a terminal, with the facts of the runs that differ."""
-    return "\n".join([*(f"{name}: {_shown(*values)}" for name, values in found.facts.items()), comparison(found)])
+    return "\n".join([*(f"{name}:{_shown(*values)}" for name, values in found.facts.items()), comparison(found)])
 
 
 def moment(stamp: int) -> str:
@@ -77,4 +78,12 @@ def _copies(found: Diff) -> list[str]:
 
 
 def _shown(one: str, other: str) -> str:
-    return " | ".join(f"{name} {' '.join(text.split()) or '-'}" for name, text in (("A", one), ("B", other)))
+    """A fact of both results: in one line, or the lines of A and B below it."""
+    both = {"A": one.splitlines() or ["-"], "B": other.splitlines() or ["-"]}
+    if all(len(lines) == 1 for lines in both.values()):
+        return " " + " | ".join(f"{name} {lines[0]}" for name, lines in both.items())
+    text = ""
+    for name, lines in both.items():
+        more = [f"and {len(lines) - _MAX_LINES} more lines"] if len(lines) > _MAX_LINES else []
+        text += "".join(f"\n  {name} {line}" for line in [*lines[:_MAX_LINES], *more])
+    return text
