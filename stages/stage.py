@@ -25,7 +25,8 @@ class Stage:
 
     def __init_subclass__(cls) -> None:
         known = {**getattr(cls, "__dataclass_fields__", {}), **vars(cls)}  # inherited ones first
-        rows = [f"{name}\n    {item.metadata['help']}" for name, item in known.items() if _is_parameter(item)]
+        about = {name: item.metadata for name, item in known.items() if _is_parameter(item)}
+        rows = [f"{name}{' : ' * bool(of['unit'])}{of['unit']}\n    {of['help']}" for name, of in about.items()]
         if cls.__doc__ and rows and "Parameters\n---" not in cls.__doc__:
             sections = re.split(r"\n\n(?=\w+\n---)", inspect.cleandoc(cls.__doc__))
             cls.__doc__ = "\n\n".join([sections[0], "\n".join(["Parameters", "----------", *rows]), *sections[1:]])

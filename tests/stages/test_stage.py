@@ -24,7 +24,10 @@ def test_help_shows_the_meaning_of_every_parameter(name: str) -> None:
     text = KINDS[name].__doc__
     assert text.count("\nParameters\n----------\n") == bool(found.parameters)
     for item in found.parameters:
-        assert item.meaning in text or "." in item.name  # those of a value such as the rover stand in its own help
+        unit = f" : {item.unit}" if item.unit else ""
+        assert (
+            f"\n{item.name}{unit}\n    {item.meaning}" in text or "." in item.name
+        )  # those of a value such as the rover stand in its own help
 
 
 IMAGE = np.zeros((60, 80), np.uint8)

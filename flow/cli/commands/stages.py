@@ -53,7 +53,8 @@ def details(node: NodeReference) -> str:
     lines += [f"output: {node.output}"] if node.output else []
     lines += ["parameters:"] if node.parameters else ["no parameters"]
     for item in node.parameters:
-        known = f"{item.type}, {item.range}" if item.range else item.type
+        unit = item.unit if item.default == "0" else ""  # other defaults have it
+        known = ", ".join(filter(None, [item.type, unit, item.range]))
         lines.append(f"  {item.name} = {item.default}  ({known})")
         lines += textwrap.wrap(item.meaning, 100, initial_indent=" " * 6, subsequent_indent=" " * 6)
     return "\n".join(lines)
