@@ -67,7 +67,8 @@ def format_brief(found: Score) -> str:
 
 def brief_figures(found: Score) -> list[float]:
     """The values of `SCORES` of a score; NaN where the truth does not have it."""
-    seen = {} if found.disparity is None else found.disparity["whole_image"]["nonocc"]
+    whole = {} if found.disparity is None else found.disparity["whole_image"]
+    seen: Mapping[str, float] = next((whole[kind] for kind in ("nonocc", "all") if whole and whole[kind]["pixels"]), {})
     ground = {} if found.terrain is None else found.terrain
     stereo = [seen.get(name, math.nan) for name in ("density", "bad_0.5", "bad_1", "rmse")]
     height = ground["heights"]["0-8 m"]["raw"]["rmse"] if ground else math.nan

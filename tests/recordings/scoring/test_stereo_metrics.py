@@ -5,7 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from recordings.scoring.score import Score
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
+from recordings.scoring.table import brief_figures
 
 NAN, INF = float("nan"), float("inf")
 
@@ -133,3 +135,9 @@ def test_a_frame_of_twice_the_pixels_counts_twice():
     found = (small + large).metrics()
     assert found["whole_image"]["all"]["bad_2"] == pytest.approx(1 / 3)
     assert found["cropped_image"]["leftmost_columns_cropped"] == [16, 32]
+
+
+def test_without_an_occlusion_mask_the_row_of_a_table_is_that_of_all_pixels():
+    pixels = [[10.0, 10.0, NAN, 12.0]], [[10.0, 10.7, 10.0, 10.0]]
+    for mask, density in ((None, 0.75), ([[255, 255, 128, 255]], 1.0)):
+        assert brief_figures(Score(disparity=measured(*pixels, mask)))[0] == density
