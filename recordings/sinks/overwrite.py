@@ -23,6 +23,7 @@ _BEGINNING = 1 << 18  # bytes that contain these
 _KEYS = {
     "summary": {"frames_in", "verdict"},
     "score": {"frames", "compared", "missing", "unmatched"},
+    "scores": {"fleet", "pipelines"},
 }
 
 
@@ -30,7 +31,7 @@ def is_ours(path: Path, kind: str) -> bool:
     """Whether the file `path` is an earlier output of roverflow of that kind, or empty, so that another may replace it.
 
     kind: "input log", as simulator and imports make them, "result log", "recording", "desk", "difference", "picture",
-    "report", "summary" or "score".
+    "report", "summary", "score" or "scores", of a fleet.
     """
     with path.open("rb") as file:
         start = file.read(_BEGINNING)

@@ -240,8 +240,9 @@ def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs
     row = run_task(Task(job, tmp_path, Pipeline.of("fast", ("disparities=48",)), False, workers=2))
     here = {"log": str(job.log), "pipeline": "fast"}
     Catalogue(tmp_path, create=True).put_all({"a": row | here, "junk": here | {"state": "unusable"}})
-    assert "no truth: junk" in said(0, "score", tmp_path, "--json", tmp_path / "scores.json").out
-    figures = json.loads((tmp_path / "scores.json").read_text())["fast"]["a"]
+    for _ in range(2):  # its own file may be replaced
+        assert "no truth: junk" in said(0, "score", tmp_path, "--json", tmp_path / "scores.json").out
+    figures = json.loads((tmp_path / "scores.json").read_text())["pipelines"]["fast"]["a"]
     assert figures["disparity"]["density"] == json.loads(rows_of(tmp_path)["a"]["scores"])["density"]
     assert "--truth is for one result log" in refused("score", tmp_path, "--truth", job.log)
 

@@ -42,10 +42,10 @@ def _score_fleet(options: argparse.Namespace) -> int:
 
     if options.truth:
         raise UsageError("--truth is for one result log; the truth of a fleet is that in its logs")
-    check_outputs({"score": options.json})
+    check_outputs({"scores": options.json})
     scores, others = score_logs(options.result)
     figures = {name: {log: json.loads(found.to_json()) for log, found in logs.items()} for name, logs in scores.items()}
-    write_text(options.json, json.dumps(figures, indent=2))
+    write_text(options.json, json.dumps({"fleet": str(options.result), "pipelines": figures}, indent=2))
     for pipeline, logs in scores.items():
         say(f"{pipeline}\n{as_table([dict(zip(SCORES, row, strict=True)) for row in score_rows(logs)], SCORES)}")
     if others:
