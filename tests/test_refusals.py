@@ -11,7 +11,8 @@ import pytest
 import rerun
 
 from flow.cli.commands.demo import check_folder
-from flow.errors import UsageError
+from flow.cli.replay import replay
+from flow.errors import SinkError, UsageError
 from recordings import McapSource, RerunSink
 from recordings.sinks.overwrite import is_ours
 from tests.conftest import SMALL, rewrite, roverflow
@@ -434,3 +435,15 @@ def test_a_result_log_needs_the_ending_of_a_log(traverse, tmp_path, refused):
 def test_a_pair_of_numbers_may_begin_with_a_minus(result, traverse, tmp_path, said):
     words = ("--log", traverse, "--at", 1, "--cell", "-1.2,0.4", "-o", tmp_path / "a.png")
     assert "cell (-1.175, 0.425) m" in said(0, "why", result, *words).out
+
+
+@pytest.mark.parametrize(
+    ("out", "rrd", "kind"), [("log.mcap", None, "result log"), ("new.mcap", "log.mcap", "recording")]
+)
+def test_a_run_of_python_replaces_no_file_that_no_run_wrote(traverse, tmp_path, monkeypatch, out, rrd, kind):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "log.mcap").write_bytes(traverse.read_bytes())
+    with pytest.raises(SinkError, match=rf"log\.mcap: it exists and is no {kind} of roverflow"):
+        replay("log.mcap", "fast", out, rrd, end=1)
+    assert (tmp_path / "log.mcap").read_bytes() == traverse.read_bytes()
+    assert [file.name for file in tmp_path.iterdir()] == ["log.mcap"]

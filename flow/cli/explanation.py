@@ -119,12 +119,12 @@ class Explanation(CellExplanation):
 
 
 def why(
-    result: Path,
+    result: Path | str,
     at: Instant,
     *,
     cell: tuple[float, float] | None = None,
     pixel: tuple[int, int] | None = None,
-    log: Path | None = None,
+    log: Path | str | None = None,
     stream: str = "navigation_map",
 ) -> Explanation:
     """Explain a cell of one frame's navigation map.
@@ -163,6 +163,7 @@ def why(
     """
     from stages.kernel_loading import loading_kernels
 
+    result, log = Path(result), Path(log) if log is not None else None
     graph = graph_of(result)
     rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
     if stream not in rules:

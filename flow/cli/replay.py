@@ -19,10 +19,10 @@ ARROW_EXTRA = "pandas"  # which the library of recordings imports, where it is i
 
 
 def replay(
-    log: Path | Sequence[Path],
+    log: Path | str | Sequence[Path | str],
     pipeline: str,
-    out: Path,
-    rrd: Path | None,
+    out: Path | str,
+    rrd: Path | str | None,
     *,
     overrides: Sequence[str] = (),
     workers: int = 2,
@@ -50,12 +50,12 @@ def replay(
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
-    logs = (log,) if isinstance(log, Path) else tuple(log)
+    logs = (Path(log),) if isinstance(log, Path | str) else tuple(map(Path, log))
     files = _files(graph, logs)
     inputs = tuple(map(str, logs)) if with_inputs else ()
     given = {"live_pipe": live_pipe, "profile": profile, "desk": desk, "inputs": inputs, "limits": _limits(graph)}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
-    outputs = _outputs(graph, {".mcap": out, ".rrd": rrd})
+    outputs = _outputs(graph, {".mcap": Path(out), ".rrd": Path(rrd) if rrd is not None else None})
     stop = Stop()
     drawing = () if rrd is None else ("recordings.sinks.rerun_recording", ARROW_EXTRA)
     with (

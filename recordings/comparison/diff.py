@@ -96,7 +96,9 @@ class Diff:
         return self.first is None
 
 
-def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] = lambda change: None) -> Diff:
+def diff(
+    one: Path | str, other: Path | str, on_change: Callable[[MessageDifference], None] = lambda change: None
+) -> Diff:
     """Compare two result logs.
 
     Parameters
@@ -122,6 +124,7 @@ def diff(one: Path, other: Path, on_change: Callable[[MessageDifference], None] 
     >>> diff(Path("a.mcap"), Path("b.mcap")).first  # doctest: +SKIP
     ('/nav/elevation_map', 1700086400013000000)
     """
+    one, other = Path(one), Path(other)
     about = {path: facts_of(path, "two logs that roverflow run wrote") for path in (one, other)}
     for path, facts in about.items():
         check_profile(path, facts)

@@ -36,9 +36,9 @@ class FoundFiles:
     part: str = ""
 
 
-def find_files(given: Path | Sequence[Path]) -> FoundFiles:
+def find_files(given: Path | str | Sequence[Path | str]) -> FoundFiles:
     """The files of a log. Raises LogError for a folder without a recording or with several."""
-    paths = [given] if isinstance(given, Path) else list(dict.fromkeys(given))
+    paths = [Path(given)] if isinstance(given, Path | str) else list(dict.fromkeys(map(Path, given)))
     folders = {path: _files_of(path) for path in paths if path.is_dir()}
     named = [path for path in paths if path not in folders]
     for path in named:

@@ -23,7 +23,7 @@ _CONTAINERS = (  # the first bytes of each, its module, and its class, which tak
 )
 
 
-def open_recording(given: Path | Sequence[Path]) -> Recording:
+def open_recording(given: Path | str | Sequence[Path | str]) -> Recording:
     """Open a file, several files or a folder as one log. Raises LogError where there is nothing to read."""
     found = find_files(given)
     with ExitStack() as stack:
@@ -33,8 +33,8 @@ def open_recording(given: Path | Sequence[Path]) -> Recording:
             stack.callback(file.close)
             opened.append(file)
         close = stack.pop_all().close
-    path = given if isinstance(given, Path) else given[0]
-    return Recording(path, opened, found.missing, found.part, close)
+    first = Path(given if isinstance(given, Path | str) else given[0])
+    return Recording(first, opened, found.missing, found.part, close)
 
 
 def _open_file(path: Path, stack: ExitStack) -> Container:

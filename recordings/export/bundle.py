@@ -53,8 +53,8 @@ FRAME = MapTopics("/nav/elevation_map", "/nav/navigation_map")
 
 
 def export(
-    result: Path,
-    out: Path,
+    result: Path | str,
+    out: Path | str,
     frames: bool = False,
     lost: Counter[str] | None = None,
     maps: Collection[str] = (),
@@ -94,6 +94,7 @@ def export(
     >>> from recordings.export.bundle import export
     >>> export(Path("out.mcap"), Path("maps"), maps=["regional_map"])  # doctest: +SKIP
     """
+    result, out = Path(result), Path(out)
     if not maps:
         topics = FRAME if frames else REGIONAL
     else:

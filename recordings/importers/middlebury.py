@@ -104,9 +104,10 @@ def logs_of(source: Path, out: Path) -> list[tuple[Path, Path]]:
     return [(folder, out / f"{folder.name}.mcap") for folder in scenes]
 
 
-def read_scene(folder: Path, stamp: int = FIRST_STAMP) -> MiddleburyScene:
+def read_scene(folder: Path | str, stamp: int = FIRST_STAMP) -> MiddleburyScene:
     """The scene of a folder, with its frame at `stamp`, ns. Raises LogError if a file is missing (the truth may be) or
     cannot be used."""
+    folder = Path(folder)
     text, numbers = _calibration(folder / CALIBRATION)
     ndisp = int(numbers.pop("ndisp"))
     left, right = (folder / name for name in IMAGES)

@@ -31,6 +31,7 @@ from recordings.ros2.to_msg import (
     transform_message,
 )
 from recordings.sinks.map_cropping import cropped
+from recordings.sinks.overwrite import refuse_foreign
 from recordings.sinks.own_types import leaves, plain_type, refusal
 from recordings.sinks.thinning import thinned
 from recordings.sinks.viewer_topics import beside_inputs, rerun_root, viewer_messages
@@ -134,6 +135,7 @@ class McapSink:
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
+        refuse_foreign(path, "result log")
         self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
         self._kinds, self._owners, self._about = dict(streams), {}, about
         self._theirs = parents_in([Path(log) for log in self.inputs]) if self.inputs else {}

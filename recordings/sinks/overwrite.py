@@ -6,6 +6,8 @@ import json
 import struct
 from pathlib import Path
 
+from recordings.errors import UnwritableError
+
 _HEADERS = tuple(  # with profile, ROS 2 or none, and library
     b"\x89MCAP0\r\n\x01"
     + struct.pack("<QI", 17 + len(profile), len(profile))
@@ -56,6 +58,12 @@ def is_ours(path: Path, kind: str) -> bool:
     follows = start[len(header) :]
     result = follows[:1] == bytes([code]) and follows[9:].startswith(name)  # 8 bytes between them are its length
     return result == (kind == "result log")
+
+
+def refuse_foreign(path: Path, kind: str) -> None:
+    """Raise UnwritableError for a file that no earlier run wrote, such as the log that is read."""
+    if Path(path).is_file() and not is_ours(Path(path), kind):
+        raise UnwritableError(f"cannot write {path}: it exists and is no {kind} of roverflow; choose another name")
 
 
 def _has_keys(path: Path, keys: set[str]) -> bool:

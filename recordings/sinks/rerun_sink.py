@@ -17,6 +17,7 @@ from flow.contracts import FrameRecord
 from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
 from recordings.sinks import DESKS
+from recordings.sinks.overwrite import refuse_foreign
 from recordings.sinks.own_types import NUMBERS, plain_type
 from stages.data import Mount, Region
 
@@ -92,6 +93,7 @@ class RerunSink:
         """
         from recordings.sinks.rerun_recording import RerunRecording
 
+        refuse_foreign(path, "recording")
         self._recording = RerunRecording(self, path, streams, about)
 
     def write(self, record: FrameRecord) -> None:

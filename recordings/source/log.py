@@ -55,7 +55,7 @@ class McapLog:
     the log -> reason; topics: stream -> topic; resolution: the rest of what the log provides.
     """
 
-    given: Path | Sequence[Path]
+    given: Path | str | Sequence[Path | str]
     source: LogSettings
     start: float | None = None
     end: float | None = None

@@ -35,12 +35,14 @@ class McapSource(LogSettings):
         "odometry": Pose,
     }
 
-    def open(self, path: Path | Sequence[Path], start: float | None = None, end: float | None = None) -> McapLog:
+    def open(
+        self, path: Path | str | Sequence[Path | str], start: float | None = None, end: float | None = None
+    ) -> McapLog:
         """Open a log; use the result as a context manager.
 
         Parameters
         ----------
-        path : Path or sequence of Path
+        path : Path, str or a sequence of them
             An MCAP file, a rosbag2 database, a ROS 1 bag, several of them, or the folder of a recording.
         start, end : float, optional
             The part to read, from `start` to before `end`, seconds after the first message.
