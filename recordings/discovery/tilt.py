@@ -105,7 +105,8 @@ def _search_tilt(
         found.remedies["inclinometer"] = [remedy for topic in bare for remedy in _meanings(topic.name)]
     else:
         found.missing["inclinometer"] = (
-            "the log has no tilt (an Imu, or a QuaternionStamped); set 'inclinometer' of the source"
+            "the log has no tilt (an Imu, or a QuaternionStamped); set 'inclinometer' of the source, and for a message "
+            "of bare angles 'pitch', 'roll' and 'tilt_model'"
         )
 
 

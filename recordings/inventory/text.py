@@ -30,7 +30,7 @@ def format_description(description: dict[str, Any]) -> str:
     if all(side in d["streams"] for side in CAMERAS):
         lines.append(_frame_line(d["frames"]))
     if d["mount"]:
-        base, position = d["mount"]["base"], d["mount"]["position"]
+        base, position = d["mount"]["base"], [round(value, 4) for value in d["mount"]["position"] or ()]
         lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
     lines += [f"transform: {transform}" for transform in d["transforms"]]
     if found := d["search_range"]:

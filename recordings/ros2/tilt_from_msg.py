@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import MISSING, dataclass
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -181,7 +182,8 @@ def _field_names(value: Any) -> list[str]:
 
 def _kind(value: Any) -> str:
     """The name of a value's type."""
-    return str(getattr(value, "__msgtype__", type(value).__name__))
+    name = "JSON object" if isinstance(value, SimpleNamespace) else type(value).__name__
+    return str(getattr(value, "__msgtype__", name))
 
 
 @dataclass(frozen=True)

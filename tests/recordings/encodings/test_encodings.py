@@ -3,6 +3,7 @@
 import json
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -99,6 +100,11 @@ def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
     assert isinstance(tilt, Tilt)
     assert tilt.stamp == 5_000_000_007
     assert np.degrees(np.arcsin(tilt.up[0])) == pytest.approx(2.0)
+
+
+def test_an_absent_field_of_json_is_refused_with_those_that_are_there():
+    with pytest.raises(LogError, match=r"no 'nod' in its JSON object \(it has pitch, roll\)"):
+        AngleField("nod", "deg", 1)(SimpleNamespace(pitch=1.0, roll=2.0))
 
 
 @pytest.mark.parametrize(
