@@ -222,14 +222,15 @@ def test_results_of_logs_above_the_working_folder_stay_in_the_folder_of_the_flee
     assert [job.name for job in jobs_of(["c.mcap", "../a.mcap"], tmp_path)] == ["a", "site/c"]
 
 
-def test_a_row_names_the_faults_and_the_first_loss_of_a_run():
+def test_a_row_names_the_faults_and_the_first_loss_of_each_kind():
     zero = dict.fromkeys(("frames_in", "frames_out", "wall_seconds", "cpu_seconds", "survey_cpu_seconds"), 0)
     fault = {"rectified": {"severity": "fault", "sentence": "left and right are swapped"}}
-    lost = [{"stream": "left", "detail": "no partner"}, {"stream": "right", "detail": "cut"}]
+    lost = [("unmatched", "left", "no partner"), ("unreadable", "log", "cut"), ("unmatched", "right", "late")]
     summary = {"verdict": "INCOMPLETE", "interrupted": False, "surveys": fault, "findings": {}, "cpu_seconds_of": {}}
-    summary |= {"drops": {"unmatched": 1, "unreadable": 1}, "ledger": lost, "outputs": []} | zero
+    summary |= {"drops": {"unmatched": 2, "unreadable": 1}, "outputs": []} | zero
+    summary["ledger"] = [dict(zip(("reason", "stream", "detail"), entry, strict=True)) for entry in lost]
     row = _columns(summary)
-    first = "1 unmatched, 1 unreadable, first: left: no partner"
+    first = "2 unmatched, first: left: no partner; 1 unreadable, first: log: cut"
     assert row["why"] == f"rectified: left and right are swapped; {first}"
     assert row["findings"] == {"rectified": "fault: left and right are swapped"}
     assert _columns(summary | {"surveys": {}})["why"] == first

@@ -179,12 +179,12 @@ def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _why(summary: Mapping[str, Any], found: Mapping[str, Mapping[str, str]]) -> str:
-    """Why a run is incomplete: its faults, the counts of its losses and the first of them; empty if it is complete."""
+    """Why a run is incomplete: its faults, and of each kind of loss the number and the first; empty if complete."""
     if summary["verdict"] == Verdict.COMPLETE:
         return ""
-    drops = ", ".join(f"{number} {reason}" for reason, number in summary["drops"].items())
-    first = [f"{drops}, first: {entry['stream']}: {entry['detail']}" for entry in summary["ledger"][:1]]
-    return "; ".join([*lines(found, Severity.FAULT), *first])
+    first = {entry["reason"]: f"{entry['stream']}: {entry['detail']}" for entry in reversed(summary["ledger"])}
+    drops = [f"{number} {reason}, first: {first[reason]}" for reason, number in summary["drops"].items()]
+    return "; ".join([*lines(found, Severity.FAULT), *drops])
 
 
 def _finished(task: Task) -> dict[str, Any] | None:
