@@ -43,8 +43,8 @@ def test_stages_before_the_change_run_once(traverse, tmp_path, said, monkeypatch
     assert output.index(f"wrote {out}") < output.index("bad-1") < output.index(f"added the errors to {out}")
     assert re.search(r"/nav/navigation_map: 2 of 2 messages differ; up to .* cells from free to hazard", output)
     assert "equal: /nav/disparity, " in output
-    # A frame has two matches, cells for its own and the regional map, and maps of its own, of the change, and regional.
-    assert runs == {"Match": 4, "Voxelise": 4, "Binarise": 6}
+    # A frame has three matches, cells for its own and the regional map, and maps of its own, changed, and regional.
+    assert runs == {"Match": 6, "Voxelise": 4, "Binarise": 6}
     assert out.stat().st_size > 10_000
 
 

@@ -63,7 +63,7 @@ def test_the_change_that_would_turn_a_verdict_turns_it(traverse, fast_result, st
 
 
 def test_the_pixels_of_a_cell_have_the_disparities_of_the_result(traverse, fast_result, stamp):
-    (x, y), *_ = places(fast_result, stamp, Cell.FREE, 1)
+    _, (x, y), *_ = places(fast_result, stamp, Cell.FREE, 4)
     found = why(fast_result, AT, cell=(x, y), log=traverse)
     recorded = read_disparity(messages(fast_result, "/nav/disparity")[stamp]).ravel()[found.pixels]
     assert found.pixels.size > 3
@@ -100,6 +100,12 @@ def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, s
     assert re.search(r"\nsearch: lowest cost \d+ to \d+, median \d+; lead over the next \d+ to \d+, median ", output)
     picture = cv2.imread(str(out)).astype(int)
     assert ((picture[..., 2] > 200) & (picture[..., 1] < 80) & (picture[..., 0] > 150)).sum() > 20
+
+
+def test_the_nearest_cell_of_fast_was_not_searched_at_full_size(traverse, fast_result, tmp_path, said, stamp):
+    (x, y), *_ = places(fast_result, stamp, Cell.FREE, 1)
+    words = ("why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse, "-o", tmp_path / "why.png")
+    assert "\nsearch: no cost below 255: not searched at full size, or nothing alike was found\n" in said(0, *words).out
 
 
 def test_what_cannot_be_explained_is_refused(traverse, fast_result, refused):

@@ -29,7 +29,8 @@ class Disparity:
     camera
         The rectified camera, if it is known.
     sigma
-        (H, W) float32, px, standard deviation of a known disparity that is no blunder (inf = no evidence), or None.
+        (H, W) float32, px, standard deviation of a known disparity that is no blunder (inf = no evidence, NaN = not
+        known yet), or None.
     costs
         (2, H, W) uint8: the smallest sum of costs that the search found at a pixel, and the smallest of all disparities
         but that one and its neighbours; 255 is 255 or more. None if they were not kept.

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.denoise import denoised
+from stages.matching.far_rows import far_rows
 from stages.matching.image_noise import noise_levels
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
@@ -121,6 +123,14 @@ class Match(Stage):
         "unknown", "pixels that the prior has nearer than the range: unknown, or copied from the prior",
         choices=("unknown", "prior"),
     )  # fmt: skip
+    max_prior_step: float = parameter(
+        0.0, "rows of near ground are copied from the prior: those where a pixel of half size is at most such a step "
+        "of depth; 0: none", unit="m", low=0,
+    )  # fmt: skip
+    max_prior_depth: float = parameter(
+        0.0, "with `max_prior_step`, rows wholly beyond this depth are copied from the prior as well; 0: none",
+        unit="m", low=0,
+    )  # fmt: skip
     keep_costs: bool = parameter(
         False, "keep the smallest sums of costs of each pixel in the result; a run with a recording sets it"
     )
@@ -144,12 +154,22 @@ class Match(Stage):
 
     def check_inputs(self, inputs: Collection[str]) -> None:
         """Raise ValueError if a search near a prior has no prior among the `inputs`, names of ports."""
-        for name, value in (("search_radius", self.search_radius), ("band_height", self.band_height)):
+        for name, unit in (("search_radius", "px"), ("band_height", "px"), ("max_prior_step", "m")):
+            value = getattr(self, name)
             if value and "prior" not in inputs:
-                raise ValueError(f"Match.{name} = {value} px needs a `prior`: connect one, or set {name} to 0")
+                raise ValueError(f"Match.{name} = {value} {unit} needs a `prior`: connect one, or set {name} to 0")
 
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
         self._check(frame, prior)
+        if prior is None or not self.max_prior_step:
+            return self._matched(frame, prior)
+        first, end = far_rows(prior, frame.camera, self.max_prior_step, self.max_prior_depth)
+        first = max(min(first, end - MIN_SIDE, len(frame.left) - MIN_SIDE), 0)
+        end = max(end, first + MIN_SIDE)
+        found = self._matched(frame_rows(frame, first, end), disparity_rows(prior, first, end))
+        return with_rows(replace(prior, camera=frame.camera), first, found)
+
+    def _matched(self, frame: StereoFrame, prior: Disparity | None) -> Disparity:
         left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
         search = self._search_range(frame.camera)
         area = self._search_area(prior, search, len(left))

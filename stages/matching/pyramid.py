@@ -47,6 +47,7 @@ class Upsample(Stage):
     Disparities are doubled, and interpolated within a surface. Source and confidence are those of the nearest pixel.
     """
 
+    keep_sigma: bool = parameter(False, "double the sigma as well; a prior needs none")
     threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
@@ -56,11 +57,16 @@ class Upsample(Stage):
             raise StageError(f"Upsample: the disparity has shape {small}, which is not half of {(height, width)}")
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         pixels = doubled(disparity.pixels, height, width, self.threads)
-        source, confidence = (
+        layers = [disparity.source, disparity.confidence]
+        if self.keep_sigma and disparity.sigma is not None:
+            layers.append(2 * disparity.sigma)
+        source, confidence, *sigma = (
             cv2.resize(layer, (2 * small[1], 2 * small[0]), interpolation=cv2.INTER_NEAREST)[:height, :width]
-            for layer in (disparity.source, disparity.confidence)
+            for layer in layers
         )
-        return Disparity(frame.stamp, pixels, source, confidence, camera=frame.camera)
+        return Disparity(
+            frame.stamp, pixels, source, confidence, camera=frame.camera, sigma=sigma[0] if sigma else None
+        )
 
 
 @dataclass(frozen=True)

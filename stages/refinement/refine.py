@@ -7,13 +7,14 @@ sizes, of superpixels and of regions of them, because walls and sand show too li
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
+from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.image_noise import noise_levels
 from stages.matching.intensity import eight_bit, gray
 from stages.matching.kernels.texture import contrast
@@ -62,7 +63,8 @@ class Refine(Stage):
     MEASURED if its support passes the same tests, else PLANE. Another filled hole must also be seen by both cameras,
     else it is FILLED. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that
     stays unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or
-    OUT_OF_VIEW. See docs/refinement.md.
+    OUT_OF_VIEW. Of a disparity of which `Match.max_prior_step` copied some rows, only the matched ones are refined. See
+    docs/refinement.md.
 
     References
     ----------
@@ -131,6 +133,14 @@ class Refine(Stage):
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
+        matched = np.empty(0, int) if disparity.sigma is None else np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
+        if not 0 < len(matched) < len(disparity.pixels):
+            return self._refined(frame, disparity)
+        first, end = int(matched[0]), int(matched[-1]) + 1
+        refined = self._refined(frame_rows(frame, first, end), disparity_rows(disparity, first, end))
+        return with_rows(replace(disparity, costs=None, camera=frame.camera), first, refined)
+
+    def _refined(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         image, other = eight_bit(frame.left, frame.right)
         guide, right = gray(image), gray(other)
         saturated = _saturated(frame.left, guide, SATURATION_LEVEL, self.threads)

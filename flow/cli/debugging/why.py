@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 HELP = "explain a cell of a navigation map: its pixels, its limits, and what would turn its verdict"
 MAX_TURNS = 5  # changes of parameters that are listed
+MAX_COST = 255  # of a pixel that was not searched, or that nothing resembles
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -141,12 +142,14 @@ def _cost_lines(found: Explanation) -> list[str]:
     """How bad the best matches are, and how ambiguous."""
     if not found.costs.size:
         return []
-    lowest, next_lowest = found.costs.astype(int)
+    lowest, next_lowest = found.costs[:, found.costs[0] < MAX_COST].astype(int)
+    if not lowest.size:
+        return [f"search: no cost below {MAX_COST}: not searched at full size, or nothing alike was found"]
     cost, lead = (
         f"{values.min()} to {values.max()}, median {sorted(values)[len(values) // 2]}"
         for values in (lowest, next_lowest - lowest)
     )
-    return [f"search: lowest cost {cost}; lead over the next {lead} (0 to 255)"]
+    return [f"search: lowest cost {cost}; lead over the next {lead} (0 to {MAX_COST})"]
 
 
 def _tilt_lines(found: Explanation) -> list[str]:

@@ -1,0 +1,40 @@
+"""Some rows of a frame and of its disparity image, to work on these only, and the way back to the whole image."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stages.data.camera import StereoFrame
+from stages.data.disparity import Disparity
+
+
+def frame_rows(frame: StereoFrame, first: int, end: int) -> StereoFrame:
+    """Rows `first` to `end` of a frame, as a frame of their own: cy of its camera counts from `first`."""
+    camera = replace(frame.camera, cy=frame.camera.cy - first, height=end - first)
+    return StereoFrame(frame.stamp, frame.left[first:end], frame.right[first:end], camera)
+
+
+def disparity_rows(disparity: Disparity, first: int, end: int) -> Disparity:
+    """Pixels, source and confidence of rows `first` to `end`."""
+    rows = slice(first, end)
+    return Disparity(disparity.stamp, disparity.pixels[rows], disparity.source[rows], disparity.confidence[rows])
+
+
+def with_rows(whole: Disparity, first: int, part: Disparity) -> Disparity:
+    """`whole` with the rows of `part` from row `first` on.
+
+    A layer that only one of them has is NaN, -1 (segments) or 255 (costs) in the rows of the other.
+    """
+    unknown = {"sigma": np.float32(np.nan), "segments": np.int32(-1), "costs": np.uint8(255)}
+    layers = {}
+    for name in ("pixels", "source", "confidence", *unknown):
+        old, new = getattr(whole, name), getattr(part, name)
+        if old is None and new is None:
+            continue
+        if old is None:
+            old = np.full((*new.shape[:-2], *whole.pixels.shape), unknown[name])
+        layers[name] = old.copy()
+        layers[name][..., first : first + len(part.pixels), :] = unknown[name] if new is None else new
+    return replace(whole, **layers)
