@@ -12,6 +12,7 @@ from flow.cli.instants import part_of
 from flow.errors import UsageError
 from recordings import McapSource
 from tests.conftest import SMALL, roverflow
+from tests.recordings.sample_log import LEFT, changed, write_sample
 from tests.viewers import viewer
 
 
@@ -37,6 +38,12 @@ def test_a_time_as_the_viewer_shows_it_is_that_of_the_frame(traverse, stamps, sh
             part = part_of(log, instant(shown(stamp)), 1, 0)
             with McapSource().open(traverse, start=part.start, end=part.end) as cut:
                 assert [item.stamp for _, stream, item in cut.events(("left",)) if stream == "left"] == [stamp]
+
+
+def test_a_time_of_day_is_that_of_stamps_also_where_they_are_of_another_clock(tmp_path):
+    with McapSource().open(write_sample(tmp_path / "log.mcap", changed(LEFT, {"header.stamp.sec": 7}))) as log:
+        for shown in ("00:00:07.2", "1970-01-01 00:00:07.2", "7200000000 ns", "0.2"):
+            assert part_of(log, instant(shown), 1, 0).stamp == 7_200_000_000
 
 
 def test_other_times_are_refused(traverse, tmp_path, capsys, refused):

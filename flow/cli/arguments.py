@@ -81,7 +81,7 @@ def instant(text: str) -> At:
         of_day = np.timedelta64(((60 * int(hours) + int(minutes)) * 60 + int(whole)) * 1_000_000_000 + ns, "ns")
         with suppress(ValueError):  # no such date
             return of_day if date is None else np.datetime64(date, "ns") + of_day
-    elif re.fullmatch(r"\d{18,19}(?: ?ns)?", text.strip()):
+    elif re.fullmatch(r"\d{18,19}|\d{1,19} ?ns", text.strip()):
         return np.datetime64(int(text.strip().removesuffix("ns")), "ns")
     with suppress(argparse.ArgumentTypeError):
         value = seconds(text)

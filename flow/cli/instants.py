@@ -54,7 +54,7 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     edges = np.concatenate([times[:1] - MARGIN, (times[1:] + times[:-1]) // 2, times[-1:] + MARGIN])
     start, first, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, chosen, high + 1))
     time, stamp = int(times[chosen]), _stamp(log, times, chosen)
-    off = ns_of(at, log.begin) - (time if isinstance(at, float | int) else stamp)
+    off = _ns(log, at) - (time if isinstance(at, float | int) else stamp)
     half = int(np.median(np.diff(times))) // 2 if times.size > 1 else 0
     beyond = (chosen == 0 and off < -half) or (chosen == times.size - 1 and off > half)
     note = f"{_outside(log, times, at)}; the {'last' if off > 0 else 'first'} one is taken" if beyond else ""
@@ -78,7 +78,7 @@ def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:
     if isinstance(at, float | int):
         first, last = ((int(time) - log.begin) / 1e9 for time in times[[0, -1]])
         return f"--at {at:g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s"
-    given, *ends = map(_shown, (ns_of(at, log.begin), _stamp(log, times, 0), _stamp(log, times, -1)))
+    given, *ends = map(_shown, (_ns(log, at), _stamp(log, times, 0), _stamp(log, times, -1)))
     return f"--at {given} is outside the images of the log, which lie from {ends[0]} to {ends[1]}"
 
 
@@ -108,9 +108,14 @@ def ns_of(at: Instant, begin: int) -> int:
     return value
 
 
+def _ns(log: McapLog, at: Instant) -> int:
+    """The log time of an instant in seconds, the stamp of any other, ns."""
+    return ns_of(at, log.begin if isinstance(at, float | int) else log.first_stamp)
+
+
 def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
     """The place of the left image nearest to an instant; None outside the log. times: log times, ns."""
-    when, absolute = ns_of(at, log.begin), not isinstance(at, float | int)
+    when, absolute = _ns(log, at), not isinstance(at, float | int)
     delay = sum(time - stamp for time, stamp in _stamps(log, times, 0, 0).items()) if absolute else 0
     if not times[0] - MARGIN <= when + delay <= times[-1] + MARGIN:
         return None

@@ -97,7 +97,7 @@ def why_regional(
         stamp = ns_of(at, int(stamps_of(result)[0]))
     else:
         with input_of(graph, result, log) as opened:
-            stamp, begin = ns_of(at, opened.begin), opened.begin
+            stamp, begin = ns_of(at, opened.first_stamp), opened.first_stamp
     navigation, terrain, written = _maps(result, stamp, stream, node.inputs["elevation"])
     if navigation.stamp < stamp:
         end = f"{(navigation.stamp - begin) / 1e9:.3f} s" if isinstance(at, float | int) else moment(navigation.stamp)

@@ -176,7 +176,10 @@ class McapLog:
         if log_start > self.file.start:
             for reader in readers:
                 self._note_last_before(log_start, reader)
-        infos, items = self._by_channel(readers), self._by_channel(self._stream_readers(calibrations, streams))
+        infos, given = self._by_channel(readers), self._stream_readers(calibrations, streams)
+        items = self._by_channel(given)
+        # An Odometry may be the pose and the tilt.
+        twins = {channel: each for each in given for channel in each.decoders if items[channel] is not each}
         if moving is not None:
             infos |= self._by_channel(self._transform_readers(moving, items))
         if wide.low is not None:
@@ -212,6 +215,8 @@ class McapLog:
                     yield from [(raw.log_time, "mount", mount)] if isinstance(mount, Mount) else ()
                 if item is not None:
                     yield raw.log_time, reader.stream, item
+                if (twin := twins.get(raw.channel)) and (other := twin(raw)) is not None:
+                    yield raw.log_time, twin.stream, other
 
     def _note_last_before(self, log_time: int, infos: TopicReader) -> None:
         """Add the calibration in force at `log_time`: the last readable one before it."""

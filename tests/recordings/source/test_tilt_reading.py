@@ -285,6 +285,8 @@ def test_poses_in_an_upright_frame_are_tilts_where_a_setting_says_so(tmp_path):
         assert (len(tilts), lost) == (len(driven.stamps), [])
         np.testing.assert_allclose(tilts[0].up, turn.inv().apply([0, 0, 1]), atol=1e-12)
         assert "in 'odom' with z up" in note
+    with McapSource(upright_frame="odom").open(path) as log:  # these poses place the rover too
+        assert sum(isinstance(item, Pose) for _, _, item in log.events()) == len(driven.stamps)
     _, lost, _ = read(path, McapSource(upright_frame="map"))
     assert "its frame is 'odom', but 'upright_frame' of the source is 'map'" in lost[0]
 
