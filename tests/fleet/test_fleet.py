@@ -245,6 +245,8 @@ def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs
         assert "no truth: junk" in said(0, "score", tmp_path, "--json", tmp_path / "scores.json").out
     figures = json.loads((tmp_path / "scores.json").read_text())["pipelines"]["fast"]["a"]
     assert figures["disparity"]["density"] == json.loads(rows_of(tmp_path)["a"]["scores"])["density"]
+    listed = json.loads(said(0, "list", tmp_path, "--where", "name = 'a'", "--json").out)
+    assert listed[0]["scores"]["density"] == figures["disparity"]["density"]
     assert "--truth is for one result log" in refused("score", tmp_path, "--truth", job.log)
 
 

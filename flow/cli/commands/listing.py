@@ -33,6 +33,8 @@ def run(options: argparse.Namespace) -> int:
 
     rows = Catalogue(options.folder).rows(options.where, options.sort)
     if options.json:
+        for row in rows:
+            row |= {name: json.loads(row[name]) for name in ("losses", "findings", "scores") if row[name]}
         say(json.dumps(rows, indent=2))
     elif options.csv:
         text = io.StringIO()
