@@ -54,9 +54,9 @@ def describe(
     """
     resolution, lost = log.resolution, log.file.lost
     damage = Damage(sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems}))
-    delays = array("q")
+    delays, of_tilts = array("q"), array("q")
     stamps = {stream: _stamps(log, stream, damage, delays if stream == "left" else None) for stream in CAMERAS}
-    stamps["inclinometer"] = _tilts(log, damage)
+    stamps["inclinometer"] = _tilts(log, damage, of_tilts)
     left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
     max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
     return {
@@ -81,6 +81,7 @@ def describe(
             "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
             "delay_s": [float(np.quantile(delays, part)) / 1e9 for part in (0, 0.5, 1)] if delays else None,
+            "tilt_delay_s": float(np.median(of_tilts)) / 1e9 if of_tilts else None,
         },
         "transforms": resolution.static.listed(),
         "mount": _mount(log),
@@ -140,17 +141,18 @@ def _stamps(log: McapLog, stream: str, damage: Damage, delays: array[int] | None
     return np.asarray(stamps, np.int64)
 
 
-def _tilts(log: McapLog, damage: Damage) -> Stamps:
+def _tilts(log: McapLog, damage: Damage, delays: array[int]) -> Stamps:
     """The stamps of the tilts, ns; errors are added to `damage`. Nothing is estimated for them.
 
-    Those of a large log are not decoded.
+    Those of a large log are not decoded. delays: as of `_stamps`.
     """
     if not _is_verified(log) or (log.resolution.tilt is not None and log.resolution.tilt.gyroscope):
-        return _stamps(log, "inclinometer", damage)
+        return _stamps(log, "inclinometer", damage, delays)
     stamps = array("q")
-    for _, stream, item in log.events(("inclinometer",)):
+    for log_time, stream, item in log.events(("inclinometer",)):
         if isinstance(item, Tilt):
             stamps.append(item.stamp)
+            delays.append(log_time - item.stamp)
         elif stream == "inclinometer":
             damage.append(str(item))
     return np.asarray(stamps, np.int64)

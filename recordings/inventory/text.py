@@ -9,6 +9,8 @@ from flow.contracts import counted
 from recordings.inventory.search_range import ROCK
 from recordings.source.cameras import CAMERAS
 
+MAX_TILT_DELAY = 0.9  # s; a run waits one second for a tilt, unless told otherwise
+
 
 def format_description(description: dict[str, Any]) -> str:
     """Format the inventory for a terminal."""
@@ -29,6 +31,10 @@ def format_description(description: dict[str, Any]) -> str:
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     if all(side in d["streams"] for side in CAMERAS):
         lines.append(_frame_line(d["frames"]))
+        late = (d["frames"]["tilt_delay_s"] or 0) - (d["frames"]["delay_s"] or [0, 0])[1]
+        if late > MAX_TILT_DELAY:
+            remedy = f"if no clock is wrong, --set=tilt.patience={late + 2:.0f}s makes a run wait for them"
+            lines.append(f"doubtful: tilts were logged {late:.1f} s later after their stamps than images; {remedy}")
     if d["mount"]:
         base, position = d["mount"]["base"], [round(value, 4) for value in d["mount"]["position"] or ()]
         lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")

@@ -54,8 +54,8 @@ class CheckMatches(Stage):
             return None
         return Finding(
             f"Only {100 * np.median(state):.0f} % of the nearest ground is matched, so the map is unreliable there. If "
-            "that ground is closer than the search range, increase `disparities`; otherwise check for dark, blurred or "
-            "textureless images, or swapped cameras.",
+            "that ground is closer than the search range, increase `disparities`; otherwise check for dark, blurred, "
+            "frozen or textureless images, for pairs of different times, or swapped cameras.",
             Severity.WARNING,
             assumes="cameras",
         )

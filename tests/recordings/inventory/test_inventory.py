@@ -126,6 +126,14 @@ def test_streams_without_stamps_are_noted(tmp_path):
     ]
 
 
+def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
+    for lateness, doubted in ((0, False), (2, True)):
+        earlier = changed(TILT, {"header.stamp.sec": lambda seconds, by=lateness: seconds - by})
+        text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", earlier)))
+        doubt = "doubtful: tilts were logged 2.0 s later after their stamps than images; if no clock is wrong"
+        assert (doubt in text) == doubted
+
+
 def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
     path = write_sample(tmp_path / "log.mcap", changed("camera_info", {"width": 60, "height": 32}))
     doubt = "cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
