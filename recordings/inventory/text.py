@@ -9,7 +9,7 @@ from flow.contracts import counted
 from recordings.inventory.search_range import ROCK
 from recordings.source.cameras import CAMERAS
 
-MAX_TILT_DELAY = 0.9  # s; a run waits one second for a tilt, unless told otherwise
+MAX_TILT_DELAY = 0.9  # s; a run waits one second for a tilt by default (tilt.patience)
 
 
 def format_description(description: dict[str, Any]) -> str:
