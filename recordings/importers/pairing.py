@@ -20,6 +20,7 @@ SIDES: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] 
     *images.SIDES[:-1],
     (re.compile(r"(?<![A-Za-z])L(?![A-Za-z])"), "R"),
     (re.compile(r"left|Left|LEFT|(?<![A-Za-z])[lL](?![A-Za-z])"), lambda found: _RIGHT[found.group()]),
+    (re.compile(r"(?<=image_)(0?)2(?=/)"), r"\g<1>3"),  # the colour cameras of KITTI
     images.SIDES[-1],
 )
 

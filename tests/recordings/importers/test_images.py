@@ -89,6 +89,11 @@ def test_the_camera_has_the_given_attitude(tmp_path, pitch_down, roll):
         (["img_cam0_9m.png", "img_cam1_9m.png"], ["img_cam0_9m.png"]),
         (["L_01.png", "L_02.png", "R_01.png", "R_02.png"], ["L_01.png", "L_02.png"]),
         (["left/L_1.png", "right/R_1.png"], ["left/L_1.png"]),
+        (
+            ["image_2/0_10.png", "image_2/1_10.png", "image_3/0_10.png", "image_3/1_10.png", "disp_occ_0/0_10.png"],
+            ["image_2/0_10.png", "image_2/1_10.png"],
+        ),
+        (["image_02/1.png", "image_03/1.png"], ["image_02/1.png"]),
     ],
 )
 def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
