@@ -14,12 +14,14 @@ SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 # Ground truth beside the images of data sets, such as Middlebury's mask0nocc.png.
 _NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z]|$)", re.IGNORECASE)
 _MAX_LISTED = 5  # files in a sentence
+_CAMERA = "|".join(f"(?<={word}{dash})" for word in ("cam", "camera", "im", "img", "image") for dash in ("", "_"))
 _RIGHT = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
 # As in names of topics, but also single letters in capitals, and several words at once: left/L_01.png.
 SIDES: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] = (
     *images.SIDES[:-1],
     (re.compile(r"(?<![A-Za-z])L(?![A-Za-z])"), "R"),
     (re.compile(r"left|Left|LEFT|(?<![A-Za-z])[lL](?![A-Za-z])"), lambda found: _RIGHT[found.group()]),
+    (re.compile(rf"(?:{_CAMERA})0(?!\d)", re.IGNORECASE), "1"),  # not the number of the image, as in cam0/0.png
     (re.compile(r"(?<=image_)(0?)2(?=/)"), r"\g<1>3"),  # the colour cameras of KITTI
     images.SIDES[-1],
 )
@@ -43,6 +45,8 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
         if not pairs:
             continue
         paired = {name for pair in pairs for name in pair}
+        if len(paired) < 2 * len(pairs):
+            raise LogError(f"{folder}: several images may be the partner of {pairs[0][0]}; name them left and right")
         if alone := [name for name in names if name not in paired]:
             more = f" and {len(alone) - _MAX_LISTED} more have" if len(alone) > _MAX_LISTED else " has"
             listed = ", ".join(alone[:_MAX_LISTED])

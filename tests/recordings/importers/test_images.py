@@ -94,6 +94,9 @@ def test_the_camera_has_the_given_attitude(tmp_path, pitch_down, roll):
             ["image_2/0_10.png", "image_2/1_10.png"],
         ),
         (["image_02/1.png", "image_03/1.png"], ["image_02/1.png"]),
+        (["cam0/0.png", "cam0/1.png", "cam1/0.png", "cam1/1.png"], ["cam0/0.png", "cam0/1.png"]),
+        (["0_cam0.png", "1_cam0.png", "0_cam1.png", "1_cam1.png"], ["0_cam0.png", "1_cam0.png"]),
+        (["cam_0/cam0_0.png", "cam_1/cam1_0.png"], ["cam_0/cam0_0.png"]),
     ],
 )
 def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
@@ -112,6 +115,10 @@ def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
         (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
         ([], "contains no image pairs, only 0 images"),
         (["0.png", "1.png", "2.png", "3.png"], r"contains no image pairs, only 4 images"),
+        (
+            ["0/0.png", "0/1.png", "1/0.png", "1/1.png"],
+            r"several images may be the partner of 0/0\.png; name them left",
+        ),
         (["im0.png", "im1.png", "view5.png"], r"view5\.png has no partner"),
         (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
     ],
