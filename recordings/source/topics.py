@@ -82,6 +82,7 @@ class DecodedTopics:
         self.decoders: dict[int, Decoder] = {}
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
+        self._ahead: dict[str, int] = {}
         weights, unpacking, dense = dict[MessageSchema, int](), Unpacking(), self._dense_topics(max_rate)
         for place, (number, channel) in enumerate(file.channels.items()):
             if place >= MAX_CHANNELS:
@@ -132,11 +133,15 @@ class DecodedTopics:
 
     def ahead_of(self, topic: str) -> int:
         """How far the last stamp of a topic is ahead of its log time, ns, where they are of two clocks; else 0."""
-        times = self.file.times(self.channels_of(topic)) if self.schemas.get(topic) in STAMPED_SCHEMAS else np.zeros(0)
-        raws = self.file.messages(self.channels_of(topic), int(times.max())) if len(times) else iter(())
-        last = next((raw for raw in raws if isinstance(raw, RawMessage)), None)
-        stamp = self.stamp_of(last) if last is not None else 0
-        return stamp - last.log_time if last and stamp and abs(stamp - last.log_time) > MAX_LATENESS_NS else 0
+        if topic not in self._ahead:
+            stamped = self.schemas.get(topic) in STAMPED_SCHEMAS
+            times = self.file.times(self.channels_of(topic)) if stamped else np.zeros(0, np.int64)
+            raws = self.file.messages(self.channels_of(topic), int(times.max())) if len(times) else iter(())
+            last = next((raw for raw in raws if isinstance(raw, RawMessage)), None)
+            stamp = self.stamp_of(last) if last is not None else 0
+            ahead = stamp - last.log_time if last is not None and stamp else 0
+            self._ahead[topic] = ahead if abs(ahead) > MAX_LATENESS_NS else 0
+        return self._ahead[topic]
 
     def is_unstamped(self, topic: str) -> bool:
         """Whether the header stamps of a topic are 0 and not those of a clock that begins there."""
