@@ -69,9 +69,11 @@ def check_cells(what: str, width: float, resolution: float, times: int = 1) -> N
 
 
 def check_rectified(stage: Stage, frame: StereoFrame) -> None:
-    """Raise StageError for a frame that is not rectified."""
+    """Raise StageError for a frame that is not rectified, or is none, as a single image."""
+    name = type(stage).__name__
+    if not isinstance(frame, StereoFrame):
+        raise StageError(f"{name}: the frame must be a stages.StereoFrame, not a {type(frame).__name__}")
     if frame.camera.raw is not None:
-        name = type(stage).__name__
         raise StageError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
 
 

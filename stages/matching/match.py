@@ -187,8 +187,8 @@ class Match(Stage):
         return Disparity(frame.stamp, pixels, source, confidence, camera=frame.camera, costs=costs)
 
     def _check(self, frame: StereoFrame, prior: Disparity | None) -> None:
-        height, width = frame.left.shape[:2]
         check_rectified(self, frame)
+        height, width = frame.left.shape[:2]
         if min(height, width) < MIN_SIDE:
             raise StageError(f"Match: images are {width}x{height}, each side must be at least {MIN_SIDE} px")
         if not -width < self.min_disparity < width:

@@ -42,6 +42,7 @@ def disparity(height: int = 60, width: int = 80, stamp: int = 7) -> Disparity:
 
 OF_FRAME_AND_DISPARITY = stages.Refine(), stages.RefinePaper(), stages.Reproject()
 JOIN = "join the disparity with the rectified frame"
+NO_FRAME = "the frame must be a stages.StereoFrame, not a"
 TIMES = "frame of 7 ns, disparity of 8 ns: join data"
 
 
@@ -50,6 +51,8 @@ TIMES = "frame of 7 ns, disparity of 8 ns: join data"
       for stage in OF_FRAME_AND_DISPARITY),
     *((stage, (RAW, disparity()), rf"put stages\.Rectify before stages\.{type(stage).__name__}")
       for stage in OF_FRAME_AND_DISPARITY),
+    (stages.Match(), (IMAGE, IMAGE), f"Match: {NO_FRAME} ndarray"),
+    (stages.Refine(), (disparity(), FRAME), f"Refine: {NO_FRAME} Disparity"),
     *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_FRAME_AND_DISPARITY[:2]),
     (Running(stages.VisualOdometry()), (FRAME, disparity(30)), JOIN),
     (stages.Upsample(), (FRAME, disparity(40, 66)), r"Upsample: .*\(40, 66\)"),
