@@ -41,7 +41,7 @@ MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression o
 COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
 BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
 DEPTH_EDGE = 1.0  # px between neighbours at an edge of depth
-DEPTH_EDGE_GRAY = 15.0  # gray levels over which a neighbour's weight falls to 1/e there
+EDGE_COLOUR = 15.0  # levels of colour over which a neighbour's weight falls to 1/e there
 # Fitted to eight Middlebury scenes and simulated frames, which count alike; tests/study.py prints the true shares.
 TRUST = Trust(
     agreed=(0.955, 0.993, 0.998),
@@ -59,8 +59,8 @@ class Refine(Stage):
     """A denser and smoother disparity image, with its superpixels.
 
     A match that moves by at most 0.5 px and two sigmas stays MEASURED if the images correlate over its support and its
-    sigma is small, else it becomes FILLED. A match that moves farther becomes PLANE. A hole that a plane fills is
-    MEASURED if its support passes the same tests, else PLANE. Another filled hole must also be seen by both cameras,
+    sigma is small, else it becomes FILLED. A match that moves farther and a hole that a plane fills are MEASURED if
+    their support passes the same tests, else PLANE. Another filled hole must also be seen by both cameras,
     else it is FILLED. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that
     stays unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or
     OUT_OF_VIEW. Of a disparity of which `Match.max_prior_step` copied some rows, only the matched ones are refined. See
@@ -149,7 +149,7 @@ class Refine(Stage):
         within = extent(smoothed, self.threads)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image)
-        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, guide, right)
+        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, image, other)
         refined, sigma, consistent = self._supported(sharp, kinds != KEPT, guide, right)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
@@ -234,10 +234,10 @@ class Refine(Stage):
             np.copyto(found.pixels, pixels, where=np.abs(found.pixels - pixels) < F32(self.min_support_shift))
         return found.pixels, found.sigma, consistent
 
-    def _sharpened(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> Array:
+    def _sharpened(self, pixels: Array, guessed: Array, image: Array, other: Array) -> Array:
         if self.edge_radius == 0:
             return pixels
-        return sharpen_edges(pixels, guessed, guide, right, self.edge_radius, DEPTH_EDGE, DEPTH_EDGE_GRAY, self.threads)
+        return sharpen_edges(pixels, guessed, image, other, self.edge_radius, DEPTH_EDGE, EDGE_COLOUR, self.threads)
 
 
 def _saturated(image: Array, guide: Array, level: int, threads: int) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
+from stages.refinement.kernels.colours import levels_apart, packed
 from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
@@ -31,7 +32,6 @@ LEFT, RIGHT = 0, 4
 STEP_LENGTHS = np.hypot(*RAYS.T).astype(np.float32)
 RAY_WEIGHTS = np.where(RAYS[:, 0] == 0, F32(ROW_WEIGHT), F32(1))
 NO_VALUE = F32(np.inf)
-BYTE_MASK, GREEN_SHIFT, BLUE_SHIFT = np.uint32(255), np.uint32(8), np.uint32(16)
 
 
 def fill_holes(
@@ -45,7 +45,7 @@ def fill_holes(
     """
     height, width = disparity.shape
     both = shared_by(threads)
-    filled, colour = both(disparity.copy, lambda: _packed(cv2.blur(image, (3, 3))))
+    filled, colour = both(disparity.copy, lambda: packed(cv2.blur(image, (3, 3))))
     kinds, first = np.zeros((height, width), np.uint8), np.zeros(height + 1, np.int64)
     by_bands(both, height, lambda top, end: _count_holes(disparity, top, end, first))
     np.cumsum(first, out=first)
@@ -58,13 +58,6 @@ def fill_holes(
     given = disparity, colour, within, F32(max_distance), margin, first, holes, steps
     by_bands(both, height, lambda top, end: _fill(*given, top, end, filled, kinds))
     return filled, kinds
-
-
-def _packed(image: Array) -> Array:
-    """The colours of a gray or RGB image, (H, W) uint32: one byte a channel."""
-    form = cv2.COLOR_GRAY2RGBA if image.ndim == 2 else cv2.COLOR_RGB2RGBA
-    packed: Array = cv2.cvtColor(image, form).view(np.uint32)[..., 0]
-    return packed
 
 
 @kernel
@@ -146,11 +139,7 @@ def _read_ray(disparity, colour, y, columns, down, across, steps, values, colour
 def _weigh_ray(own, hidden, max_distance, ray_weight, length, steps, colours, values, weights):
     """Weights of the disparities on one ray for holes of colours `own`; a value without weight becomes inf."""
     for i in range(own.size):
-        one, other = own[i], colours[i]
-        first = abs(np.int32(one & BYTE_MASK) - np.int32(other & BYTE_MASK))
-        second = abs(np.int32((one >> GREEN_SHIFT) & BYTE_MASK) - np.int32((other >> GREEN_SHIFT) & BYTE_MASK))
-        third = abs(np.int32((one >> BLUE_SHIFT) & BYTE_MASK) - np.int32((other >> BLUE_SHIFT) & BYTE_MASK))
-        colour_difference = F32(max(first, max(second, third)))
+        colour_difference = F32(levels_apart(own[i], colours[i]))
         distance, ratio, value = length * F32(steps[i]), colour_difference * F32(1 / HALF_WEIGHT_COLOUR), values[i]
         weight = ray_weight / ((F32(1) + ratio * ratio) * (distance + F32(HALF_WEIGHT_DISTANCE)))
         counts = (

@@ -40,8 +40,8 @@ def label_origin(
     (H, W) bool, pixels that a plane moved or filled; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W)
     float32, the result; consistent: (H, W) bool, pixels where the images agree with it; reasons: (H, W) uint8, codes of
     pixels that stay unknown; sigma: (H, W) float32, px, of the result, 0 = not stated; max_move: px that a MEASURED
-    pixel may differ from its match, beside two sigmas. A filled pixel is MEASURED where the images agree with it and
-    its sigma is stated.
+    pixel may differ from its match, beside two sigmas. A pixel that was filled or differs more is MEASURED where the
+    images agree with it and its sigma is stated.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
     steps = np.arange(256) / 255
@@ -84,7 +84,8 @@ def _label(
             elif match != match and kinds[y, x] != OCCLUSION and consistent[y, x] and sigma[y, x] > 0:
                 source[y, x], worth[y, x] = MEASURED, backed * within[blur]
             elif match == match:
-                source[y, x], worth[y, x] = PLANE, replaced
+                source[y, x] = MEASURED if consistent[y, x] and sigma[y, x] > 0 else PLANE
+                worth[y, x] = replaced
             elif kinds[y, x] == KEPT:
                 source[y, x], worth[y, x] = PLANE, plane
             else:
@@ -107,7 +108,8 @@ def label_origin_reference(
         np.isnan(matches) & (kinds != OCCLUSION) & consistent & (sigma > 0), np.isfinite(matches), kinds == KEPT,
         kinds == MISMATCH,
     ]  # fmt: skip
-    codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, MEASURED, PLANE, PLANE, FILLED]
+    moved = np.where(consistent & (sigma > 0), MEASURED, PLANE)
+    codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, MEASURED, moved, PLANE, FILLED]
     tables = [np.interp(own, MATCH_CONFIDENCES, values) * within for values in (trust.agreed, trust.alone)]
     worths: list[Any] = [
         0.0,

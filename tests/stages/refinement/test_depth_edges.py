@@ -1,26 +1,27 @@
 """Depth edges: the choice of a surface equals the plain reference and moves an edge to where the images have it."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
-from stages.refinement.refine import DEPTH_EDGE, DEPTH_EDGE_GRAY
+from stages.refinement.refine import DEPTH_EDGE, EDGE_COLOUR
 
-RULE = 3, DEPTH_EDGE, DEPTH_EDGE_GRAY
+RULE = 3, DEPTH_EDGE, EDGE_COLOUR
 
 
 def sharpened(disparity, left, right=None):
     return sharpen_edges(disparity, np.zeros(disparity.shape, bool), left, left if right is None else right, *RULE)
 
 
-@given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 5), st.integers(0, 2**31))
-def test_the_choice_equals_its_reference(height, width, radius, seed):
+@given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 5), st.integers(0, 2**31), st.sampled_from([(), (3,)]))
+def test_the_choice_equals_its_reference(height, width, radius, seed, channels):
     random = np.random.default_rng(seed)
     disparity = np.float32(random.choice([-900.0, 3.0, 5.0], (height, width)) + random.normal(0, 0.2, (height, width)))
     disparity[random.random(disparity.shape) < 0.2] = np.nan
-    left, right = random.integers(0, 60, (2, height, width), np.uint8)
+    left, right = random.integers(0, 60, (2, height, width, *channels), np.uint8)
     everything = disparity, random.random(disparity.shape) < 0.3, left, right, radius, *RULE[1:]
     sharp = sharpen_edges(*everything)
     np.testing.assert_array_equal(sharp, sharpen_edges_reference(*everything))
@@ -33,6 +34,25 @@ def test_a_misplaced_depth_edge_moves_onto_the_image_edge():
     truth = np.where(image > 100, np.float32(30), np.float32(10))
     off = truth.copy()
     off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 10
+    assert np.array_equal(sharpened(off, image), truth)
+
+
+def test_colours_move_an_edge_that_gray_levels_do_not_show():
+    image = np.full((40, 60, 3), (120, 90, 100), np.uint8)
+    image[:, 30:] = 90, 106, 98
+    assert np.ptp(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) <= 1
+    truth = np.where(image[..., 0] < 100, np.float32(30), np.float32(10))
+    off = truth.copy()
+    off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 10
+    assert np.array_equal(sharpened(off, image), truth)
+
+
+def test_an_edge_that_is_two_pixels_off_moves_twice():
+    image = np.full((40, 60), 80, np.uint8)
+    image[:, 30:] = 140
+    truth = np.where(image > 100, np.float32(30), np.float32(10))
+    off = truth.copy()
+    off[:, 28:30] = 30
     assert np.array_equal(sharpened(off, image), truth)
 
 
