@@ -252,9 +252,9 @@ def print_worth(cases: list[Case]) -> None:
         )
         for low, high in pairwise((0.6, 0.8, 0.9, 0.95, 1.01))
     }
-    for name, source in (("replaced", 2), ("plane", 2), ("mismatch", 3), ("occlusion", 3)):
+    for name in ("replaced", "plane", "mismatch", "occlusion"):
         value = np.float32(getattr(TRUST, name))
-        origins[name] = lambda found, source=source, value=value: (found.source == source) & (found.confidence == value)
+        origins[name] = lambda found, value=value: found.confidence == value
     assert len({*TRUST[3:]}) == 4, "origins of equal confidence cannot be distinguished"
     rows: dict[str, list[tuple[float, float, float]]] = {}
     for case in cases:

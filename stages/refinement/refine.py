@@ -60,11 +60,10 @@ class Refine(Stage):
 
     A match that moves by at most 0.5 px and two sigmas stays MEASURED if the images correlate over its support and its
     sigma is small, else it becomes FILLED. A match that moves farther and a hole that a plane fills are MEASURED if
-    their support passes the same tests, else PLANE. Another filled hole must also be seen by both cameras,
-    else it is FILLED. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that
-    stays unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or
-    OUT_OF_VIEW. Of a disparity of which `Match.max_prior_step` copied some rows, only the matched ones are refined. See
-    docs/refinement.md.
+    their support passes the same tests, else PLANE. Another filled hole must also be seen by both cameras, else it is
+    FILLED. The confidence is the calibrated fraction of such pixels that are right within 1 px. A pixel that stays
+    unknown keeps its reason. A dropped match has SKY (saturated patch), UNIQUENESS (low confidence) or OUT_OF_VIEW.
+    Rows that `Match.max_prior_step` copied are refined already and stay as they are. See docs/refinement.md.
 
     References
     ----------
