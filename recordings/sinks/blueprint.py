@@ -230,7 +230,7 @@ def _flat_views(drawn: Specs, *panels: Panel) -> list[rrb.View]:
 
 
 def _images(drawn: Specs) -> _Part | None:
-    """Two columns: left and right image, two disparities, superpixels, origin of each disparity, and own images.
+    """Rows of two: left and right image, two disparities, superpixels, origin of each disparity, and own images.
 
     Of several stereo streams the last one of the camera's size is shown (the rectified one), of other streams the last.
     The others are tabs behind it. The last disparity has a view of its own beside the tabs of the earlier ones.
@@ -244,7 +244,11 @@ def _images(drawn: Specs) -> _Part | None:
         _tabs([*reversed(_flat_views(drawn, Panel.SOURCE)), *_flat_views(drawn, *ERRORS)]),
         _tabs(_flat_views(drawn, Panel.OWN_IMAGE)),
     ]
-    return _grid(parts, 2)
+    present = [part for part in parts if part is not None]
+    rows = [present[first : first + 2] for first in range(0, len(present), 2)]
+    if len(rows) > 1 and len(rows[-1]) == 1:  # no place stays empty
+        rows[-2:] = [rows[-2] + rows[-1]]
+    return _stack(rrb.Horizontal(*row) if len(row) > 1 else row[0] for row in rows)
 
 
 def _image_tabs(drawn: Specs) -> list[_Part | None]:

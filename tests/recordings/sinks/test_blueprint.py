@@ -29,6 +29,19 @@ def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one():
     assert sorted(names) == ["frames", "ledger", "left", "matched", "run"]
 
 
+@pytest.mark.parametrize("number", range(2, 8))
+def test_the_overview_has_no_empty_place_for_any_number_of_images(number):
+    def empty(part: Any) -> int:
+        """The cells without content of the grids of a part."""
+        inner = part.contents if hasattr(part, "grid_columns") else []
+        return (-len(inner) % part.grid_columns if inner and part.grid_columns else 0) + sum(map(empty, inner))
+
+    panels = ["LEFT", "RIGHT", "DISPARITY", "SOURCE", "OWN_IMAGE", "SUPERPIXELS", "DISPARITY"][:number]
+    specs = [ViewSpec(Panel[panel], f"stream{count}", "", panel.lower()) for count, panel in enumerate(panels)]
+    assert {*panels} <= {view.name.rpartition(": ")[2].upper() for view in views(container(specs))}
+    assert empty(container(specs)) == 0
+
+
 def test_two_streams_of_one_type_have_tabs_of_two_names():
     def names(*streams):
         panels = ((Panel.RELIEF, "relief"), (Panel.LAYER, "elevation"), (Panel.LAYER, "slope"))
