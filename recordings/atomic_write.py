@@ -28,6 +28,14 @@ def temporary_name(path: Path, mark: str = "") -> Path:
     return path.with_name(f"{path.name}.{mark or f'{os.getpid()}-{next(_numbers)}'}.partial")
 
 
+def check_writable(path: Path) -> None:
+    """Raise UnwritableError if no file can be written at `path`."""
+    temporary = temporary_name(path)
+    with writing(path):
+        temporary.touch()
+        temporary.unlink()
+
+
 def give_name(temporary: Path, path: Path) -> None:
     """Rename a finished file once its content is on the disk. Raises OSError."""
     _flush_to_disk(temporary)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from flow.errors import UsageError
-from recordings.atomic_write import written
+from recordings.atomic_write import check_writable, written
 from recordings.containers.finding import RESULT_ENDING
 from recordings.sinks.overwrite import is_ours
 
@@ -66,4 +66,5 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
             raise UsageError(f"{path} exists and is no {kind} of roverflow; choose another name or remove it")
         if kind == "result log" and path.suffix.lower() != ".mcap":
             raise UsageError(f"{path} is no name of a log; end it in .mcap")
+        check_writable(path)
         taken.append(resolved)
