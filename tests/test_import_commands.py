@@ -85,3 +85,18 @@ def test_the_help_of_import_names_its_assumptions(capsys):
     with pytest.raises(SystemExit):
         roverflow("import", "middlebury", "--help")
     assert "assumes level, 1 m above ground" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("given", "lacking"),
+    [
+        ((), "SOURCE, OUT.mcap, --calibration, --height, --pitch-down or --attitudes"),
+        (("a", "b.mcap", "--height", 1), "--calibration, --pitch-down or --attitudes"),
+        (("a", "b.mcap", "--height", 1, "--attitudes", "a.csv"), "--calibration"),
+    ],
+)
+def test_one_sentence_names_all_that_a_command_line_lacks(given, lacking, capsys):
+    with pytest.raises(SystemExit) as caught:
+        roverflow("import", "images", *given)
+    assert caught.value.code == 2
+    assert capsys.readouterr().err.endswith(f"error: the following arguments are required: {lacking}\n")

@@ -146,9 +146,27 @@ def _exit_code(error: BaseException) -> int:
     return UNUSABLE if isinstance(error, LogError) and not isinstance(error, UnwritableError) else FAILED
 
 
+class CommandParser(argparse.ArgumentParser):
+    """Names all that a command line lacks at once. argparse itself names alternatives only when the rest is there."""
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """The options and the unknown words of a command line."""
+        self._given = argparse.Namespace() if namespace is None else namespace
+        return super().parse_known_args(args, self._given)
+
+    def error(self, message: str) -> NoReturn:
+        """End the program with the usage and a sentence."""
+        if message.startswith("the following arguments are required"):
+            for group in self._mutually_exclusive_groups:
+                options = group._group_actions
+                if group.required and all(getattr(self._given, each.dest) == each.default for each in options):
+                    message += f", {' or '.join(each.option_strings[-1] for each in options)}"
+        super().error(message)
+
+
 def parser() -> argparse.ArgumentParser:
     """The parser of the command line; every command declares its own arguments."""
-    top = argparse.ArgumentParser(
+    top = CommandParser(
         prog="roverflow",
         description="Turn the log of a rover into disparity, point clouds, elevation and navigation maps.",
         epilog="Exit codes: 0 complete; 1 an output or the program failed; 2 wrong usage, or an unusable log; "
