@@ -210,10 +210,9 @@ def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) ->
     """
     images = [read_pixels(path) for path in pair]
     height, width = images[0].shape[:2]
-    if images[0].shape != images[1].shape or images[0].dtype != images[1].dtype:
-        kinds = ("gray" if image.ndim == 2 else "colour" for image in images)
-        shapes = " and ".join(f"{p.shape[1]}x{p.shape[0]} {p.dtype} {k}" for p, k in zip(images, kinds, strict=True))
-        raise LogError(f"{pair[0]} and {pair[1]} differ in size or kind ({shapes})")
+    if images[0].shape[:2] != images[1].shape[:2] or images[0].dtype != images[1].dtype:
+        shapes = " and ".join(f"{pixels.shape[1]}x{pixels.shape[0]} {pixels.dtype}" for pixels in images)
+        raise LogError(f"{pair[0]} and {pair[1]} differ in size or depth ({shapes})")
     if not (0 <= values["cx"] < width and 0 <= values["cy"] < height):
         raise LogError(
             f"the calibration's centre (cx {values['cx']:g}, cy {values['cy']:g}) is outside {pair[0]}, which is "

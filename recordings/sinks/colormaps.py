@@ -136,8 +136,7 @@ def gray_difference(left: Array, right: Array, disparity: Array, max_width: int)
     ours = cv2.remap(left, x, y, cv2.INTER_NEAREST)
     theirs = cv2.remap(right, np.where(seen, partner, np.float32(0)), y, cv2.INTER_LINEAR)
     ours, theirs = top_eight_bits(ours, theirs)
-    if ours.ndim == 3:
-        ours, theirs = (cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (ours, theirs))
+    ours, theirs = (cv2.cvtColor(each, cv2.COLOR_RGB2GRAY) if each.ndim == 3 else each for each in (ours, theirs))
     (mean, deviation), (their_mean, their_deviation) = (
         np.ravel(cv2.meanStdDev(image, mask=seen.astype(np.uint8))).tolist() for image in (ours, theirs)
     )

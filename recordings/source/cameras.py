@@ -164,5 +164,4 @@ def _mismatches(
 
 def _kind(pixels: Array) -> str:
     """The properties in which the two images of a frame must agree."""
-    kind = "gray" if pixels.ndim == 2 else "colour"
-    return f"{pixels.shape[1]}x{pixels.shape[0]} {kind} of {8 * pixels.itemsize} bit"
+    return f"{pixels.shape[1]}x{pixels.shape[0]} of {8 * pixels.itemsize} bit"

@@ -206,7 +206,7 @@ class StereoFrame:
     stamp
         Nanoseconds.
     left, right
-        (H, W) gray or (H, W, 3) RGB, uint8 or uint16.
+        (H, W) gray or (H, W, 3) RGB, uint8 or uint16. One may be gray and the other RGB.
     camera
         The stereo camera.
 
@@ -228,7 +228,7 @@ class StereoFrame:
         publish_stamp(self)
         publish_image(self, "left")
         publish_image(self, "right")
-        if self.left.shape != self.right.shape:
+        if self.left.shape[:2] != self.right.shape[:2]:
             raise StageError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
         if self.left.dtype != self.right.dtype:
             raise StageError(f"StereoFrame: left is {self.left.dtype}, right is {self.right.dtype}; record both alike")

@@ -29,6 +29,11 @@ def eight_bit(*images: Array) -> tuple[Array, ...]:
     return tuple(table[image] for image in images)
 
 
+def alike(left: Array, right: Array) -> tuple[Array, Array]:
+    """Two uint8 images as they are; if only one of them is gray, both gray."""
+    return (left, right) if left.ndim == right.ndim else (gray(left), gray(right))
+
+
 def gray(image: Array) -> Array:
     """A gray or RGB uint8 image as gray (H, W) uint8."""
     luma: Array = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)

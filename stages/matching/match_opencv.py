@@ -13,7 +13,7 @@ import numpy as np
 
 from flow.contracts import StageError
 from stages.data import Array, Disparity, PixelOrigin, StereoFrame
-from stages.matching.intensity import eight_bit, gray
+from stages.matching.intensity import alike, eight_bit, gray
 from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32
@@ -82,7 +82,7 @@ class MatchOpenCV(Stage):
     def __call__(self, frame: StereoFrame) -> Disparity:
         check_rectified(self, frame)
         left, right = eight_bit(frame.left, frame.right)
-        pixels, source = self._matched(left, right) if self.color else self._matched(gray(left), gray(right))
+        pixels, source = self._matched(*alike(left, right)) if self.color else self._matched(gray(left), gray(right))
         bare = _texture(gray(left), self.block_size) <= self.min_texture
         pixels[bare], source[bare] = np.nan, PixelOrigin.BLANK
         return Disparity(frame.stamp, pixels, source, _agreement(pixels, np.isfinite(pixels)), camera=frame.camera)

@@ -16,7 +16,7 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
 from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.image_noise import noise_levels
-from stages.matching.intensity import eight_bit, gray
+from stages.matching.intensity import alike, eight_bit, gray
 from stages.matching.kernels.texture import contrast
 from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.depth_edges import sharpen_edges
@@ -148,7 +148,7 @@ class Refine(Stage):
         within = extent(smoothed, self.threads)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image)
-        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, image, other)
+        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, *alike(image, other))
         refined, sigma, consistent = self._supported(sharp, kinds != KEPT, guide, right)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,

@@ -211,10 +211,20 @@ def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tm
         import_images(left, right, file, tmp_path / "other.mcap", pitch_down=10, height=1)
 
 
+def test_a_colour_image_may_have_a_gray_partner(tmp_path):
+    left, right = make_pairs(tmp_path, 1)
+    save(right[0], cv2.cvtColor(picture(1), cv2.COLOR_RGB2GRAY))
+    assert picture(0).ndim == 3
+    assert import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1) == (1, [])
+    images = {stream: item for _, stream, item in events(tmp_path / "out.mcap") if stream in ("left", "right")}
+    frame = images["left"].pair_with(images["right"])
+    assert (frame.left.shape, frame.right.shape) == ((16, 24, 3), (16, 24))
+
+
 def test_images_of_two_sizes_and_other_files_are_refused(tmp_path):
     left, right = make_pairs(tmp_path, 1)
     save(right[0], picture(0)[:8])
-    with pytest.raises(LogError, match="differ in size or kind"):
+    with pytest.raises(LogError, match="differ in size or depth"):
         import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
     right[0].write_bytes(b"no picture")
     with pytest.raises(LogError, match=r"0-right\.png is not a readable image"):

@@ -185,7 +185,7 @@ def test_a_camera_with_only_broken_images_is_missing(tmp_path, whole, monkeypatc
             assert log.missing["right"].startswith(f"{RIGHT}: the image is cut: ")
 
 
-GRAY = {"encoding": "mono8", "step": WIDTH, "data": lambda data: data[: WIDTH * HEIGHT]}
+DEEP = {"encoding": "mono16", "step": 2 * WIDTH, "data": lambda data: data[: 2 * WIDTH * HEIGHT]}
 CROPPED = {"height": HEIGHT - 2, "data": lambda data: data[: 3 * WIDTH * (HEIGHT - 2)]}
 
 
@@ -194,10 +194,10 @@ CROPPED = {"height": HEIGHT - 2, "data": lambda data: data[: 3 * WIDTH * (HEIGHT
     ("topic", "values", "problems"),
     [
         (
-            RIGHT, GRAY,
+            RIGHT, DEEP,
             dict.fromkeys(
                 ("left", "right"),
-                f"the images on {LEFT} are 24x16 colour of 8 bit, those on {RIGHT} are 24x16 gray of 8 bit; "
+                f"the images on {LEFT} are 24x16 of 8 bit, those on {RIGHT} are 24x16 of 16 bit; "
                 "record both in one format",
             ),
         ),

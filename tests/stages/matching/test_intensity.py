@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stages.matching.intensity import eight_bit, gray
+from stages.matching.intensity import alike, eight_bit, gray
 
 
 def test_eight_bit_images_pass_untouched() -> None:
@@ -35,6 +35,13 @@ def test_a_few_dead_pixels_do_not_set_the_range() -> None:
 @pytest.mark.parametrize("level", [0, 700, 65535])
 def test_a_uniform_image_stays_uniform(level: int) -> None:
     assert len(np.unique(eight_bit(np.full((4, 5, 3), level, np.uint16))[0])) == 1
+
+
+def test_both_images_become_gray_where_one_is() -> None:
+    colour = np.random.default_rng(0).integers(0, 256, (4, 5, 3)).astype(np.uint8)
+    for left, right in ((colour, gray(colour)), (gray(colour), colour)):
+        assert all(np.array_equal(image, gray(colour)) for image in alike(left, right))
+    assert alike(colour, colour) == (colour, colour)
 
 
 def test_green_is_the_brightest_part_of_gray_and_gray_stays_gray() -> None:
