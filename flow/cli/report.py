@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def headline(summary: dict[str, Any]) -> str:
     frames = f"{complete} of {counted(total, 'frame')}" if of_total else counted(complete, "frame")
     cut_off = summary["interrupted"] and summary["verdict"] != Verdict.COMPLETE
     outcome = f"interrupted after {frames}" if cut_off else f"{frames} complete"
-    losses = {reason: number for reason, number in drops.items() if reason != LossReason.ABANDONED}
+    losses = {reason: number for reason, number in by_cause(drops) if reason != LossReason.ABANDONED}
     abandoned = f", {drops[LossReason.ABANDONED]} abandoned" if LossReason.ABANDONED in drops else ""
     lost = ", ".join(f"{number} {reason}" for reason, number in losses.items())
     count = f", {counted(sum(losses.values()), 'loss', 'losses')}: {lost}" if losses else ""
@@ -59,6 +60,11 @@ def headline(summary: dict[str, Any]) -> str:
     faulty = [name for group in groups for name, item in group.items() if item["severity"] == Severity.FAULT]
     faults = f", fault reported by {' and '.join(faulty)}" if faulty else ""
     return f"{summary['verdict']}: {outcome}{abandoned}{count}{faults}; {summary['frames_per_second']:.2f} frames/s"
+
+
+def by_cause(drops: Mapping[str, int]) -> list[tuple[str, int]]:
+    """The counts of losses, the causes of others first: a lost left image leaves the right one unmatched."""
+    return [(str(reason), drops[reason]) for reason in LossReason if reason in drops]
 
 
 def report(summary: dict[str, Any]) -> None:
@@ -71,7 +77,7 @@ def report(summary: dict[str, Any]) -> None:
     found = [summary["surveys"], summary["findings"]]
     for line in [line for part in found for line in lines(part, Severity.NOTE)]:
         say(f"  {line}")
-    for reason, number in summary["drops"].items():
+    for reason, number in by_cause(summary["drops"]):
         first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
         begin = summary.get("log_begin" if reason == LossReason.UNREADABLE else "first_stamp")  # log times, stamps
         place = f"{first['stream']} at {_moment(first['stamp'], begin)}"

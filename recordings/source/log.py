@@ -64,6 +64,7 @@ class McapLog:
     refused: Mapping[str, str] = field(init=False)
     topics: Mapping[str, str] = field(init=False)
     _estimator: UpEstimator | None = field(init=False, default=None)  # the last one
+    _moving: MovingMount | None = field(init=False, default=None)  # the last one
     _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -169,6 +170,7 @@ class McapLog:
             if stream in (*streams, "log"):
                 yield log_start, stream, problem
         moving = self.resolution.moving.again() if self.resolution.moving and "mount" in streams else None
+        self._moving = moving
         if self.resolution.mount is not None and "mount" in streams and moving is None:
             yield log_start, "mount", self.resolution.mount
         calibrations = {side: CalibrationHistory(info.model) for side, info in self.resolution.infos.items()}
@@ -262,6 +264,8 @@ class McapLog:
             found["right"] = Finding(self.notes()["right"], Severity.WARNING)
         if self._estimator and self.resolution.tilt and (fault := self.resolution.tilt.fault(self._estimator)):
             found["inclinometer"] = fault
+        if self._moving and (gaps := self._moving.gaps(self.first_stamp)):
+            found["mount"] = Finding(f"{self.notes()['mount']}; {gaps}", Severity.WARNING)
         return found
 
     def stamp_of(self, raw: RawMessage) -> int:

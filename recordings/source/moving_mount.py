@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from flow.contracts import counted
 from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, stamp_or, transform_of
@@ -38,7 +39,7 @@ class MovingMount:
     """The mount of a camera on the rover, while `samples` has its transforms.
 
     inclinometer, base: their frames; static: the transforms that do not move; links: those that do; topics: theirs;
-    joints: by name.
+    joints: by name; lost: transform -> stamps, ns, of the frames that lack it.
     """
 
     camera: Camera
@@ -49,12 +50,13 @@ class MovingMount:
     topics: Sequence[str]
     joints: Mapping[str, Joint]
     samples: dict[Link, list[tuple[int, Transform]]] = field(init=False)
+    lost: dict[Link, list[int]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.samples = {link: [] for link in self.links}
 
     def again(self) -> MovingMount:
-        """The same without samples."""
+        """The same without samples and lost frames."""
         return replace(self)
 
     @property
@@ -71,8 +73,23 @@ class MovingMount:
 
     def at(self, stamp: int) -> Mount:
         """The mount at `stamp`, ns. Raises LogError if a transform is unknown then."""
-        moved = [_interpolated(link, samples, stamp) for link, samples in self.samples.items()]
+        moved = list[Transform]()
+        for link, samples in self.samples.items():
+            try:
+                moved.append(_interpolated(link, samples, stamp))
+            except LogError:
+                self.lost.setdefault(link, []).append(stamp)
+                raise
         return mount_of(self.camera, self.inclinometer, self.base, self.static.joined(moved), None, stamp)
+
+    def gaps(self, begin: int) -> str:
+        """The transforms that frames lack, and when, in seconds after `begin`, ns; empty if none is lost."""
+        found = list[str]()
+        for (parent, child), stamps in self.lost.items():
+            first, last = ((stamp - begin) / 1e9 for stamp in (stamps[0], stamps[-1]))
+            lacking = f"{counted(len(stamps), 'frame')} from {first:+.1f} s to {last:+.1f} s"
+            found.append(f"'{parent}' <- '{child}' has a gap: {lacking} lack it, and their images are lost")
+        return "; ".join(found)
 
     def first(self) -> Mount:
         """The mount at the first time at which all transforms are known."""

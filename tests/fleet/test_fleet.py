@@ -230,7 +230,7 @@ def test_a_row_names_the_faults_and_the_first_loss_of_each_kind():
     summary |= {"drops": {"unmatched": 2, "unreadable": 1}, "outputs": []} | zero
     summary["ledger"] = [dict(zip(("reason", "stream", "detail"), entry, strict=True)) for entry in lost]
     row = _columns(summary)
-    first = "2 unmatched, first: left: no partner; 1 unreadable, first: log: cut"
+    first = "1 unreadable, first: log: cut; 2 unmatched, first: left: no partner"
     assert row["why"] == f"rectified: left and right are swapped; {first}"
     assert row["findings"] == {"rectified": "fault: left and right are swapped"}
     assert _columns(summary | {"surveys": {}})["why"] == first

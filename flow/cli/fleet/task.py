@@ -17,6 +17,7 @@ from typing import Any
 
 from flow.cli.fleet.jobs import Job
 from flow.cli.replay import product_version, replay
+from flow.cli.report import by_cause
 from flow.config.loader import SHIPPED, load, shipped
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, UsageError
@@ -183,7 +184,7 @@ def _why(summary: Mapping[str, Any], found: Mapping[str, Mapping[str, str]]) -> 
     if summary["verdict"] == Verdict.COMPLETE:
         return ""
     first = {entry["reason"]: f"{entry['stream']}: {entry['detail']}" for entry in reversed(summary["ledger"])}
-    drops = [f"{number} {reason}, first: {first[reason]}" for reason, number in summary["drops"].items()]
+    drops = [f"{number} {reason}, first: {first[reason]}" for reason, number in by_cause(summary["drops"])]
     return "; ".join([*lines(found, Severity.FAULT), *drops])
 
 

@@ -61,8 +61,10 @@ def test_the_verdict_line_counts_the_losses_by_reason():
     lost = {"failed": 1, "unreadable": 2}
     assert (
         verdict_line(frames_out=17, drops=lost)
-        == "INCOMPLETE: 17 of 18 frames complete, 3 losses: 1 failed, 2 unreadable"
+        == "INCOMPLETE: 17 of 18 frames complete, 3 losses: 2 unreadable, 1 failed"
     )
+    lost = verdict_line(drops={"unmatched": 5, "unreadable": 5})
+    assert lost.endswith(": 5 unreadable, 5 unmatched")  # the cause first
     assert verdict_line(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Severity
 from recordings import McapSource
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
@@ -108,10 +109,18 @@ def test_a_frame_without_the_transform_of_its_time_is_lost(tmp_path):
     def broken(stamp):
         return None if START + 900 * MS < stamp < START + 2300 * MS else joints(stamp)
 
-    mounts, lost, _ = read(written(tmp_path / "log.mcap", broken))
+    mounts, lost, _ = read(path := written(tmp_path / "log.mcap", broken))
     assert len(mounts) == FRAMES - 3
     assert len(lost) == 3
     assert all("the transform 'base_link' <- 'mast' moves, and" in sentence for sentence in lost)
+    with McapSource().open(path) as log:
+        assert not log.faults()
+        assert len(list(log.events())) > FRAMES
+        found = log.faults()["mount"]
+    assert found.severity is Severity.WARNING
+    assert found.sentence.endswith(
+        "; 'base_link' <- 'mast' has a gap: 3 frames from +1.1 s to +2.1 s lack it, and their images are lost"
+    )
 
 
 def test_a_mast_that_stands_still_may_be_logged_rarely(tmp_path):
