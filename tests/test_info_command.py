@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from flow.config.loader import SHIPPED
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import read_disparity
-from tests.conftest import FRAMES, mcap_rows, roverflow, write_mcap
+from tests.conftest import FRAMES, edit_of, mcap_rows, rewrite, roverflow, write_mcap
 from tests.recordings.sample_log import INFOS, LEFT, RIGHT, TILT, changed, dropped, replaced, write_sample
 
 
@@ -105,6 +106,21 @@ def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
     enough = f"--set=disparities={found['range_px']:.0f}"
     assert f"{enough} includes it" in said(0, "info", traverse, "--set", "disparities=16").out
     assert f"fewer than the 192 disparities: {enough} is faster" in said(0, "info", traverse).out
+
+
+@pytest.mark.parametrize("times", [1, 10, 1000])  # 1000: written in mm
+def test_info_doubts_a_baseline_for_which_no_search_range_is_enough(traverse, tmp_path, said, times):
+    def longer(index: int, message: Any) -> None:
+        message.p = message.p * np.where(np.arange(12) == 3, times, 1.0)
+
+    log = rewrite(traverse, tmp_path / "log.mcap", edit_of("right/camera_info", "sensor_msgs/msg/CameraInfo", longer))
+    found = json.loads(said(0, "info", log, "--json").out)["search_range"]
+    output = said(0, "info", log).out
+    assert found["range_px"] <= 1024
+    assert bool(found["doubt"]) == (times > 1)
+    doubt = f"reaches beyond 320 px: the baseline of {0.24 * times:g} m, or the height of 0.90 m, looks wrong"
+    assert (doubt in output) == (times > 1)
+    assert ("--set=disparities" in output) == (times == 1)
 
 
 def test_info_recognises_a_result_and_its_pipeline(result, said):

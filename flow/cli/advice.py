@@ -113,10 +113,10 @@ def _costs(pipeline: str, description: Mapping[str, Any]) -> str:
     )
 
 
-def _range_advice(found: Mapping[str, float] | None, graph: Graph) -> list[str]:
+def _range_advice(found: Mapping[str, Any] | None, graph: Graph) -> list[str]:
     """What to set if the ground has more disparities than the pipeline searches, or by far fewer."""
     searched = max((getattr(node.actor, "disparities", 0) for node in graph.nodes), default=0)
-    if found is None or not searched:
+    if found is None or found["doubt"] or not searched:
         return []
     enough = f"--set=disparities={found['range_px']:.0f}"
     if searched >= AMPLE * found["range_px"]:

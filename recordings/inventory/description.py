@@ -204,7 +204,7 @@ def _calibration(log: McapLog) -> dict[str, Any] | None:
     return values | {"rectified": left.rectified, "doubts": list(camera.doubts)}
 
 
-def _search_range(log: McapLog) -> dict[str, float] | None:
+def _search_range(log: McapLog) -> dict[str, Any] | None:
     """The disparities that the camera's mount and the first tilt suggest; None if its height is unknown."""
     cameras, mount = log.resolution.cameras, log.resolution.mount
     if cameras is None or mount is None or mount.base_from_camera is None:

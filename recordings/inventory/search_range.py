@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 
 from stages.data import Array, StereoCamera
 
 ROCK = 0.3  # m; height above the ground of what should still be within the search range
+MAX_DISPARITIES = 1024  # that matchers search
 
 
 def ground_disparity(camera: StereoCamera, up: Array, height: float) -> float:
@@ -32,17 +34,24 @@ def ground_disparity(camera: StereoCamera, up: Array, height: float) -> float:
     return max(0.0, camera.fx * camera.baseline * inverse_depth - offset) if inverse_depth else 0.0
 
 
-def search_range(camera: StereoCamera, up: Array, height: float) -> dict[str, float] | None:
-    """The disparities of level ground and of a rock on it, px, and a search range that holds both.
+def search_range(camera: StereoCamera, up: Array, height: float) -> dict[str, Any] | None:
+    """The disparities of level ground and of a rock on it, px, a search range that holds both, and what is doubtful.
 
     None if the camera is not above the rock, which means that its height is unknown.
     """
     if height <= ROCK or not math.isfinite(height):
         return None
     ground, rock = (ground_disparity(camera, up, height - above) for above in (0.0, ROCK))
+    doubt, most = "", min(camera.width, MAX_DISPARITIES)
+    if ground >= most:
+        doubt = (
+            f"level ground would have up to {ground:.0f} px, and no search in these images reaches beyond {most} px: "
+            f"the baseline of {camera.baseline:g} m, or the height of {height:.2f} m, looks wrong"
+        )
     return {
         "height_m": height,
         "ground_px": ground,
         "rock_px": rock,
-        "range_px": 16.0 * max(1, math.ceil((rock + 1) / 16)),
+        "range_px": min(16.0 * max(1, math.ceil((rock + 1) / 16)), MAX_DISPARITIES),
+        "doubt": doubt,
     }

@@ -44,6 +44,7 @@ def format_description(description: dict[str, Any]) -> str:
             f"disparities: level ground has up to {found['ground_px']:.0f} px in this view, a rock {ROCK} m high up to "
             f"{found['rock_px']:.0f} px (camera {found['height_m']:.2f} m above '{d['mount']['base']}')"
         )
+        lines += [f"doubtful: {found['doubt']}"] if found["doubt"] else []
     reasons = dict.fromkeys(() if d["result"] else d["missing"].values())
     for why in reasons:
         if why in d.get("refused", ""):
