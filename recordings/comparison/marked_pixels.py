@@ -11,9 +11,9 @@ import numpy as np
 
 from recordings.atomic_write import written
 from recordings.export.page_layout import page_of
+from recordings.png import png
 from recordings.sinks.colormaps import top_eight_bits
 from recordings.sinks.overwrite import PICTURE
-from recordings.sinks.png import png
 from stages.data import Array
 
 MARK = np.array([235, 40, 200], np.float32)  # RGB

@@ -10,9 +10,9 @@ import numpy as np
 
 from recordings.export.page_layout import add_bar, add_legend, map_page, page_of, with_rover
 from recordings.export.png_pages import disparity_page, relief_page, verdict_page
+from recordings.png import png
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_layers, read_occupancy_grid
 from recordings.sinks import colormaps
-from recordings.sinks.png import png
 from stages.data import Array, Cell, ElevationMap, NavigationMap
 
 DISPARITY_LIMIT = 1.0  # px at the ends of the scale

@@ -15,9 +15,9 @@ from recordings.atomic_write import written
 from recordings.comparison.diff import MessageDifference
 from recordings.comparison.pages import pages
 from recordings.comparison.sweep import Sweep
+from recordings.png import png
 from recordings.ros2.cdr import full_name
 from recordings.sinks.blueprint import CLOCK, FRAME
-from recordings.sinks.png import png
 
 MAX_FRAMES = 50  # stamps that are drawn
 MAX_WAITING = 4  # messages that wait for a thread that draws them

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 
 from recordings.comparison.diff import Diff
 from recordings.export.page_layout import INK, PAPER, round_step
-from recordings.sinks.png import png
+from recordings.png import png
 from stages.data import Array
 
 A_RGB, VARIANT_RGB = (110, 114, 126), (226, 150, 40)

@@ -16,9 +16,9 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.export.page_layout import add_bar, add_legend, map_page, page_of, with_rover
 from recordings.mcap.file import McapFile, iter_decoded
+from recordings.png import png
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from recordings.sinks import colormaps
-from recordings.sinks.png import png
 from stages.data import Array, Cell, ElevationMap, NavigationMap
 
 

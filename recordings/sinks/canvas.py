@@ -17,10 +17,10 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 
+from recordings.png import png
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import CURVES, LEDGER, LEDGER_CHARS, Panel, ViewSpec
 from recordings.sinks.colormaps import UNKNOWN_RGB, Legend, Rgb
-from recordings.sinks.png import png
 from stages.data import Array, ElevationMap, NavigationMap, StereoCamera
 
 TEXT_RGB: Rgb = (225, 228, 235)

@@ -9,11 +9,11 @@ import numpy as np
 import rerun as rr
 
 from flow.contracts import counted
+from recordings.png import png
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import CAMERA_RGB, Canvas, label_counts
-from recordings.sinks.png import png
 from stages.data import (
     LEVEL_FRAME,
     Array,

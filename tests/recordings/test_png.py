@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from recordings.sinks.png import png
+from recordings.png import png
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (2, 2), (61, 83), (480, 640)])
