@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -39,10 +39,8 @@ from recordings.sinks.follower import Follower
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
+from recordings.sinks.settings import RecordingSettings
 from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
-
-if TYPE_CHECKING:
-    from recordings.sinks.rerun_sink import RerunSink
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
@@ -55,12 +53,14 @@ FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum
 
 
 class RerunRecording:
-    """A recording that is being written, with the settings of its `RerunSink`.
+    """A recording that is being written, with its settings.
 
     streams: name -> type of item, in the pipeline's order; about: facts of the run for its summary.
     """
 
-    def __init__(self, settings: RerunSink, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+    def __init__(
+        self, settings: RecordingSettings, path: Path, streams: Mapping[str, type], about: Mapping[str, str]
+    ) -> None:
         self._settings, self._path, self._streams, self._about = settings, Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
         self._viewer: Follower | None = None

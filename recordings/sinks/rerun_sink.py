@@ -1,4 +1,4 @@
-"""The sink that writes every intermediate of a run into a rerun recording: its settings, and what it can draw.
+"""The sink that writes every intermediate of a run into a rerun recording, and what it can draw.
 
 rerun takes long to import, so it is imported when a recording is opened.
 """
@@ -14,21 +14,18 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from flow.contracts import FrameRecord
-from flow.parameters import check_parameters, parameter
 from recordings.errors import LogError
-from recordings.sinks import DESKS
 from recordings.sinks.overwrite import refuse_foreign
 from recordings.sinks.own_types import NUMBERS, plain_type
+from recordings.sinks.settings import RecordingSettings
 from stages.data import Mount, Region
 
 if TYPE_CHECKING:
     from recordings.sinks.rerun_recording import RerunRecording
 
-MIN_WIDTH = 8  # px, of a picture
-
 
 @dataclass(eq=False)
-class RerunSink:
+class RerunSink(RecordingSettings):
     """Writes a rerun recording, which `rerun FILE.rrd` opens.
 
     A type of `stages.data` is drawn by its logger. Of other types, images, numbers, texts, points, and tables and
@@ -41,37 +38,11 @@ class RerunSink:
     True
     """
 
-    application_id: str = parameter("roverflow", "recordings of one application share the layout that the viewer saves")
-    max_points: int = parameter(8_000, "most points drawn of a cloud", low=1)
-    max_width: int = parameter(
-        0, "widest picture; an intermediate has three eighths of it. 0: half as wide as the camera's images, but 320 "
-        "to 640 px, and intermediates 160 to 240 px",
-        low=0, unit="px",
-    )  # fmt: skip
-    jpeg_quality: int = parameter(75, "of the camera images", low=1, high=100)
-    every: int = parameter(1, "images, clouds and surfaces of each n-th frame are drawn", low=1)
-    max_megabytes: int = parameter(
-        0, "room of the recording before its compression; 0: no limit. Images, clouds and surfaces are drawn half as "
-        "often each time that half of the remaining room is used",
-        low=0, unit="MB",
-    )  # fmt: skip
-    live_pipe: int = parameter(
-        0, "file descriptor of a pipe to a viewer, which gets the recording while it is written; 0: none", low=0
-    )
-    without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
-    limits: tuple[str, ...] = parameter(
-        (),
-        "limits of layers, as elevation_map/step=0.17, which their scales show; `run` sets those of the hazard rule",
-    )
-    desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
-
     suffix = ".rrd"
     asks: ClassVar = {"keep_costs": True}  # of matchers
 
     def __post_init__(self) -> None:
-        check_parameters(self)
-        if 0 < self.max_width < MIN_WIDTH:
-            raise ValueError(f"RerunSink.max_width must be 0 or at least {MIN_WIDTH} px, not {self.max_width} px")
+        super().__post_init__()
         self._recording: RerunRecording | None = None  # while it is open
 
     def wants(self, stream: str, kind: Any) -> bool:
