@@ -56,7 +56,7 @@ COSTS = {
     "census": Cost(24, 12, 12, 70, (
         .50, .595, .703, .806, .876, .925, .956, .973, .983, .989, .993, .996, .997, .998, .998,
     )),
-    "census+gradient": Cost(59, 44, 16, 100, (
+    "census+gradient": Cost(59, 40, 16, 100, (
         .45, .492, .553, .632, .703, .767, .821, .866, .894, .923, .958, .975, .980, .987, .994,
     )),
 }  # fmt: skip
@@ -99,6 +99,11 @@ class Match(Stage):
     )  # fmt: skip
     p2: int = parameter(
         0, "penalty of a larger step where the image has no edge; 0: suits the cost", low=0, high=230
+    )  # fmt: skip
+    unseen_cost: int = parameter(
+        0, "cost of a partner outside the right image; 0: suits the cost. A coarse match without a good prior needs more,"
+        " or it prefers such a partner where near ground is in view",
+        low=0, high=100,
     )  # fmt: skip
     uniqueness: int = parameter(0, "margin by which the best sum of paths must beat the next", low=0, high=254)
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
@@ -288,7 +293,7 @@ class Match(Stage):
         confidence[0] = 0  # unknown
         return SgmParams(
             gradient=self.cost == "census+gradient", diagonals=self.paths == 8, p1=p1,
-            p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=cost.unseen_cost, disparities=len(search),
+            p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=self.unseen_cost or cost.unseen_cost, disparities=len(search),
             min_disparity=search.start, uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance,
             speckle_range=SPECKLE_RANGE, max_speckle_size=self.max_speckle_size, confidence_of=confidence,
             keep_costs=self.keep_costs,
