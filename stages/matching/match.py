@@ -101,8 +101,8 @@ class Match(Stage):
         0, "penalty of a larger step where the image has no edge; 0: suits the cost", low=0, high=230
     )  # fmt: skip
     unseen_cost: int = parameter(
-        0, "cost of a partner outside the right image; 0: suits the cost. A coarse match without a good prior needs more,"
-        " or it prefers such a partner where near ground is in view",
+        0, "cost of a partner outside the right image; 0: suits the cost. A match without a good prior needs more, or "
+        "it prefers such partners to those of near ground",
         low=0, high=100,
     )  # fmt: skip
     uniqueness: int = parameter(0, "margin by which the best sum of paths must beat the next", low=0, high=254)
@@ -293,10 +293,10 @@ class Match(Stage):
         confidence[0] = 0  # unknown
         return SgmParams(
             gradient=self.cost == "census+gradient", diagonals=self.paths == 8, p1=p1,
-            p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=self.unseen_cost or cost.unseen_cost, disparities=len(search),
-            min_disparity=search.start, uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance,
-            speckle_range=SPECKLE_RANGE, max_speckle_size=self.max_speckle_size, confidence_of=confidence,
-            keep_costs=self.keep_costs,
+            p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=self.unseen_cost or cost.unseen_cost,
+            disparities=len(search), min_disparity=search.start, uniqueness=self.uniqueness,
+            lr_tolerance=self.lr_tolerance, speckle_range=SPECKLE_RANGE, max_speckle_size=self.max_speckle_size,
+            confidence_of=confidence, keep_costs=self.keep_costs,
         )  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import fast_part, kernel, part
+from stages.compiled.jit import fast_part, kernel
 from stages.compiled.parallel import Fork, by_bands
 from stages.data import Array
 from stages.matching.kernels.texture import BLOCK
@@ -65,9 +65,10 @@ def _gather(pixels, guessed, guide, left, right, scale, first, end, blocks):
             total, count = F32(0), F32(0)
             lr, ll, rr = F32(0), F32(0), F32(0)
             rows = range(j * BLOCK, min((j + 1) * BLOCK, height))
-            columns = range(i * BLOCK, min((i + 1) * BLOCK, width))
+            columns = range(min(BLOCK, width - i * BLOCK))
             for y in rows:
-                for x in columns:
+                for column in columns:
+                    x = np.uint64(i * BLOCK + column)  # without sign: numba looks for no negative index
                     d = pixels[y, x]
                     if d != d or guessed[y, x]:
                         continue
@@ -77,7 +78,8 @@ def _gather(pixels, guessed, guide, left, right, scale, first, end, blocks):
                     if F32(0) <= at <= F32(width - 1):
                         before, factor = int(at), scale[guide[y, x]]
                         one = F32(left[y, x])
-                        here, beside = F32(right[y, before]), F32(right[y, min(before + 1, width - 1)])
+                        here = F32(right[y, np.uint64(before)])
+                        beside = F32(right[y, np.uint64(min(before + 1, width - 1))])
                         other = here + (at - F32(before)) * (beside - here)
                         lr += one * other * factor
                         ll += one * one * factor
@@ -87,9 +89,10 @@ def _gather(pixels, guessed, guide, left, right, scale, first, end, blocks):
             mean = total / count
             sx, sy, sxx, sxy, syy, sxd, syd, sdd = F32(0), F32(0), F32(0), F32(0), F32(0), F32(0), F32(0), F32(0)
             for y in rows:
-                for x in columns:
+                for column in columns:
+                    x = np.uint64(i * BLOCK + column)
                     if pixels[y, x] == pixels[y, x] and not guessed[y, x]:
-                        u, v = F32(x - i * BLOCK) - F32(0.5 * (BLOCK - 1)), F32(y - j * BLOCK) - F32(0.5 * (BLOCK - 1))
+                        u, v = F32(column) - F32(0.5 * (BLOCK - 1)), F32(y - j * BLOCK) - F32(0.5 * (BLOCK - 1))
                         e = pixels[y, x] - mean
                         sx += u
                         sy += v
@@ -132,25 +135,27 @@ def _fit(blocks, start, radius, size, gated, first, end, planes):
     for j in range(first, end):
         for i in range(0, width, LANES):
             work[SUMS * LANES :] = 0
-            for layer in range(3):
-                _copy(start[layer, j], i, work[(START + layer) * LANES :], LANES)
+            _copy(start, j, i, work, LANES, 3)
             for down in range(max(-radius, -j), min(radius, height - 1 - j) + 1):
-                for layer in range(BLOCK_LAYERS):
-                    _copy(blocks[layer, j + down], i - MAX_RADIUS, row[layer * WIDE :], WIDE)
+                _copy(blocks, j + down, i - MAX_RADIUS, row, WIDE, BLOCK_LAYERS)
                 for across in range(-radius, radius + 1):
                     _add(row[MAX_RADIUS + across :], work, F32(across) * size, F32(down) * size, gated)
             for lane in range(min(LANES, width - i)):
                 _solve(work, lane, planes[:, j, i + lane])
 
 
-@part
-def _copy(row, start, target, count):
-    """Copy `count` values of a row; beyond the row they are 0."""
-    first, end = max(-start, 0), min(count, row.size - start)
-    if first > 0 or end < count:
-        target[:count] = 0
-    for lane in range(first, end):
-        target[lane] = row[start + lane]
+@fast_part
+def _copy(layers, j, start, target, count, depth):
+    """Copy `count` values from `start` on of row j of the first `depth` layers; beyond the row they are 0."""
+    if start >= 0 and start + count <= layers.shape[2]:
+        for layer in range(depth):
+            for lane in range(count):  # indices without sign: numba looks for no negative one, and the loop vectorises
+                target[layer * count + lane] = layers[layer, np.uint64(j), np.uint64(start) + np.uint64(lane)]
+        return
+    for layer in range(depth):
+        for lane in range(count):
+            inside = 0 <= start + lane < layers.shape[2]
+            target[layer * count + lane] = layers[layer, j, start + lane] if inside else F32(0)
 
 
 @fast_part

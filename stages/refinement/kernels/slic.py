@@ -131,9 +131,10 @@ def _assign(colour, centres, rows, cols, position_weight, first_row, end_row, la
                     for x in range(size):
                         work[TILE + x], work[2 * TILE + x] = pixels[x, 1], pixels[x, 2]
                 _find_nearest(work, F32(y), position_weight)
+                own, middle = labels[y, start : start + size], col[start : start + size]
                 for x in range(size):
                     nearest = np.int32(work[3 * TILE + x])
-                    labels[y, start + x] = (row + nearest // 3 - 1) * cols + col[start + x] + nearest % 3 - 1
+                    own[x] = (row + nearest // 3 - 1) * cols + middle[x] + nearest % 3 - 1
 
 
 @fast_part

@@ -77,14 +77,12 @@ def _move(framed, disparity, radius, moved, first, end):
                 for at in range(start + ((v - y + radius) & 1), start + 2 * radius + 1, 2):
                     there = slice(at, at + LANES)
                     _add(own, framed[0, v, there], framed[1, v, there], framed[2, v, there], sums)
-            for j in range(min(LANES, width - start)):
-                x = start + j
-                count, g, e = sums[j], sums[LANES + j], sums[2 * LANES + j]
-                moved[y, x] = disparity[y, x]
-                if count >= least:
-                    contrast = sums[3 * LANES + j] - g * g / count + count * IMAGE_NOISE * IMAGE_NOISE
-                    step = (sums[4 * LANES + j] - g * e / count) / contrast
-                    moved[y, x] -= min(max(step, -MAX_SHIFT), MAX_SHIFT)
+            before, after = disparity[y, start : start + LANES], moved[y, start : start + LANES]
+            for x in range(before.size):
+                count, g, e = sums[x], sums[LANES + x], sums[2 * LANES + x]
+                contrast = sums[3 * LANES + x] - g * g / count + count * IMAGE_NOISE * IMAGE_NOISE
+                step = (sums[4 * LANES + x] - g * e / count) / contrast
+                after[x] = before[x] - min(max(step, -MAX_SHIFT), MAX_SHIFT) if count >= least else before[x]
 
 
 @part

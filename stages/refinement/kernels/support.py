@@ -56,9 +56,12 @@ PIXEL_SIGMAS, PIXEL_DEVIATION = 10.0, 0.1  # a match farther off the plane than 
 MIN_BACKING = 4  # matches in the block of a guessed pixel that is supported
 MIDDLE = 0.5 * (BLOCK - 1)  # of a block, from its first pixel
 # Layers of the work array, LANES pixels each: those of four planes, then inputs and three results of the pixels
-BASE, SLOPE, SHARE, SCATTER, UNCERTAIN, ALIKE, PLANES = range(7)
+BASE, SLOPE, DROP, SHARE, SCATTER, UNCERTAIN, ALIKE, PLANES = range(8)
 DISPARITY, OWN, NEAR, RESULT = range(4 * PLANES, 4 * PLANES + 4)
 WORK_LAYERS = RESULT + 3
+# Layers of a row: disparities by their place in a block, what a block has in common, and three results of each place
+OF_DISPARITY, OF_OWN, OF_NEAR, OF_RESULT = 0, BLOCK, BLOCK + 1, BLOCK + 2
+ROW_LAYERS = OF_RESULT + 3 * BLOCK
 
 
 class Support(NamedTuple):
@@ -148,68 +151,89 @@ def _blend(
     """Each pixel moves towards the planes of the four blocks around it, as far as it lies on them.
 
     Handled together are every fourth of 4 * LANES pixels: each of them lies alike between the middles of four blocks.
+    These blocks are the same for BLOCK rows.
     """
-    width = pixels.shape[1]
+    width, blocks = pixels.shape[1], variance.shape[1]
     work = np.zeros(WORK_LAYERS * LANES, np.float32)
-    for y in range(first, end):
-        j, top = y // BLOCK, (y - BLOCK // 2) // BLOCK
-        lower = (F32(y) - F32(MIDDLE)) / F32(BLOCK) - F32(top)
-        for left in range(-1, (width - 1 - BLOCK // 2) // BLOCK + 1, LANES):
+    rows = np.zeros((BLOCK, ROW_LAYERS, blocks + 1 + LANES), np.float32)  # from the block left of the first one on
+    for top in range((first - BLOCK // 2) // BLOCK, (end - 1 - BLOCK // 2) // BLOCK + 1):
+        start = top * BLOCK + BLOCK // 2
+        band = range(max(first, start), min(end, start + BLOCK))
+        for y in band:
+            _split(pixels[y], variance[y // BLOCK], correlated[y // BLOCK], rows[y - start])
+        for left in range(-1, blocks, LANES):
             for k in range(4):
-                above, share = top + k // 2, lower if k >= 2 else F32(1) - lower
-                if 0 <= above < planes.shape[1]:
-                    down = F32(y - above * BLOCK) - F32(MIDDLE)
-                    _take_planes(planes[:, above], spread[above], left + k % 2, down, share, work, PLANES * k)
-                else:
-                    work[(PLANES * k + SHARE) * LANES : (PLANES * k + SHARE + 1) * LANES] = 0
-            for phase in range(BLOCK):
-                start = left * BLOCK + BLOCK // 2 + phase
-                lanes = range(1 if start < 0 else 0, min(LANES, (width - start + BLOCK - 1) // BLOCK))
-                for lane in lanes:
-                    x = start + BLOCK * lane
-                    work[DISPARITY * LANES + lane], work[OWN * LANES + lane] = pixels[y, x], variance[j, x // BLOCK]
-                    work[NEAR * LANES + lane] = correlated[j, x // BLOCK]
-                _mix(work, F32(phase) + F32(0.5))
-                for lane in lanes:
-                    x = start + BLOCK * lane
-                    d, moved_to = pixels[y, x], work[RESULT * LANES + lane]
-                    moved[y, x], sigma[y, x], correlation[y, x] = d, F32(np.inf), F32(0)
-                    if d == d:
-                        moved[y, x] = moved_to
-                        if y >= first_row[x] and (not guessed[y, x] or matches[j, x // BLOCK] >= MIN_BACKING):
-                            sigma[y, x] = work[(RESULT + 1) * LANES + lane]
-                            correlation[y, x] = work[(RESULT + 2) * LANES + lane]
+                _take_planes(planes, spread, top + k // 2, left + k % 2, work, PLANES * k)
+            for y in band:
+                row, down = rows[y - start], F32(y - start) + F32(0.5)
+                for phase in range(BLOCK):
+                    place = (BLOCK // 2 + phase) % BLOCK
+                    at = left + 1 + (BLOCK // 2 + phase) // BLOCK
+                    _copy_lanes(row[OF_DISPARITY + place, at:], work[DISPARITY * LANES :])
+                    if phase % (BLOCK // 2) == 0:  # the next blocks
+                        _copy_lanes(row[OF_OWN, at:], work[OWN * LANES :])
+                        _copy_lanes(row[OF_NEAR, at:], work[NEAR * LANES :])
+                    _mix(work, F32(phase) + F32(0.5), down)
+                    for layer in range(3):
+                        _copy_lanes(work[(RESULT + layer) * LANES :], row[OF_RESULT + 3 * place + layer, at:])
+        for y in band:
+            backing = matches[y // BLOCK]
+            for x in range(width):
+                d, block, result = pixels[y, x], x // BLOCK, rows[y - start, OF_RESULT + 3 * (x % BLOCK) :]
+                stated = d == d and y >= first_row[x] and (not guessed[y, x] or backing[block] >= MIN_BACKING)
+                moved[y, x] = result[0, block + 1] if d == d else d
+                sigma[y, x] = result[1, block + 1] if stated else F32(np.inf)
+                correlation[y, x] = result[2, block + 1] if stated else F32(0)
 
 
 @part
-def _take_planes(planes, spread, start, down, share, work, layer):
-    """Copy what `_mix` needs of LANES planes in a row; those beyond its ends, and without matches, have no share."""
-    first, end = max(-start, 0), min(LANES, spread.size - start)
+def _split(pixels, variance, correlated, row):
+    """Copy a row of pixels, apart by their place in a block, and of what its blocks have in common."""
+    for x in range(pixels.size):
+        row[OF_DISPARITY + x % BLOCK, x // BLOCK + 1] = pixels[x]
+    for i in range(variance.size):
+        row[OF_OWN, i + 1], row[OF_NEAR, i + 1] = variance[i], correlated[i]
+
+
+@part
+def _copy_lanes(source, target):
+    for lane in range(LANES):
+        target[lane] = source[lane]
+
+
+@part
+def _take_planes(planes, spread, j, start, work, layer):
+    """Copy what `_mix` needs of LANES planes in row j; those beyond its ends, and without matches, have no share."""
+    first, end = max(-start, 0), min(LANES, spread.shape[1] - start)
     work[layer * LANES : (layer + PLANES) * LANES] = 0
-    target, at = work[layer * LANES :], start + first
+    if not 0 <= j < len(spread):
+        return
+    target, at, planes = work[layer * LANES :], start + first, planes[:, j]
     a, b, c, weight = planes[A, at:], planes[B, at:], planes[C, at:], planes[WEIGHT, at:]
-    residual, alike, uncertain = planes[RESIDUAL, at:], planes[CORRELATION, at:], spread[at:]
+    residual, alike, uncertain = planes[RESIDUAL, at:], planes[CORRELATION, at:], spread[j, at:]
     for lane in range(end - first):
         i = first + lane
-        target[BASE * LANES + i], target[SLOPE * LANES + i] = c[lane] + b[lane] * down, a[lane]
-        target[SHARE * LANES + i] = share if weight[lane] > 0 else F32(0)
+        target[BASE * LANES + i], target[SLOPE * LANES + i], target[DROP * LANES + i] = c[lane], a[lane], b[lane]
+        target[SHARE * LANES + i] = F32(1) if weight[lane] > 0 else F32(0)
         target[SCATTER * LANES + i], target[UNCERTAIN * LANES + i] = residual[lane], uncertain[lane]
         target[ALIKE * LANES + i] = alike[lane]
 
 
 @part
-def _mix(work, across):
-    """The disparity, sigma and correlation of LANES pixels, `across` px right of the middles of the left planes."""
+def _mix(work, across, down):
+    """The disparity, sigma and correlation of LANES pixels, `across`, `down` px from the middle of the first plane."""
     for i in range(LANES):
         d, own = work[DISPARITY * LANES + i], work[OWN * LANES + i]
         scale = F32(1) / (F32(PIXEL_SIGMAS) * np.sqrt(own) + F32(PIXEL_DEVIATION))
         weights, value, scatter, random, common = F32(0), F32(0), F32(0), F32(0), F32(0)
         for k in range(4):
             plane = PLANES * k * LANES + i
-            aside = across - F32(BLOCK * (k % 2))
-            off = work[plane + BASE * LANES] + work[plane + SLOPE * LANES] * aside - d
+            aside, below = across - F32(BLOCK * (k % 2)), down - F32(BLOCK * (k // 2))
+            base = work[plane + BASE * LANES] + work[plane + DROP * LANES] * below
+            off = base + work[plane + SLOPE * LANES] * aside - d
             near = max(F32(1) - (off * scale) ** 2, F32(0))
-            weight = work[plane + SHARE * LANES] * (F32(1) - abs(aside) / F32(BLOCK)) * near * near
+            share = (F32(1) - abs(below) / F32(BLOCK)) * (F32(1) - abs(aside) / F32(BLOCK))
+            weight = work[plane + SHARE * LANES] * share * near * near
             weights += weight
             value += weight * off
             scatter += weight * work[plane + SCATTER * LANES]
