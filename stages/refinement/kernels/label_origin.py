@@ -15,6 +15,7 @@ from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION
 F32 = np.float32
 MATCH_CONFIDENCES = 0.5, 0.75, 1.0
 SIGMA_STEPS = 64  # in one px, of the table of the share of errors within 1 px
+WITHIN = np.array([math.erf(SIGMA_STEPS / max(code, 1) / math.sqrt(2)) for code in range(256)], np.float32)
 MEASURED, PLANE, FILLED = int(PixelOrigin.MEASURED), int(PixelOrigin.PLANE), int(PixelOrigin.FILLED)
 
 
@@ -49,13 +50,12 @@ def label_origin(
         [np.interp(steps, MATCH_CONFIDENCES, values) for values in (trust.agreed, trust.alone)], np.float32
     )
     others = np.array(trust[2:], np.float32)
-    within = np.array([math.erf(SIGMA_STEPS / max(code, 1) / math.sqrt(2)) for code in range(256)], np.float32)
 
     def label(first: int, end: int) -> None:
         rows = slice(first, end)
         _label(
             matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], consistent[rows], reasons[rows],
-            sigma[rows], F32(max_move), tables, others, within, source[rows], worth[rows],
+            sigma[rows], F32(max_move), tables, others, source[rows], worth[rows],
         )  # fmt: skip
 
     by_bands(shared_by(threads), len(matches), label)
@@ -64,8 +64,7 @@ def label_origin(
 
 @kernel
 def _label(
-    matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, max_move, tables, others, within, source,
-    worth,
+    matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, max_move, tables, others, source, worth,
 ):  # fmt: skip
     backed, replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
@@ -80,9 +79,9 @@ def _label(
             elif near:
                 source[y, x] = MEASURED
                 step = np.int64(np.rint(min(max(confidence[y, x], F32(0)), F32(1)) * F32(255)))
-                worth[y, x] = tables[0 if agreed[y, x] else 1, step] * within[blur]
+                worth[y, x] = tables[0 if agreed[y, x] else 1, step] * WITHIN[blur]
             elif match != match and kinds[y, x] != OCCLUSION and consistent[y, x] and sigma[y, x] > 0:
-                source[y, x], worth[y, x] = MEASURED, backed * within[blur]
+                source[y, x], worth[y, x] = MEASURED, backed * WITHIN[blur]
             elif match == match:
                 source[y, x] = MEASURED if consistent[y, x] and sigma[y, x] > 0 else PLANE
                 worth[y, x] = replaced
