@@ -14,8 +14,8 @@ needed fewer times; the others find other work.
 A stage may return None, where nothing is new; then `Unchanged` passes through everything downstream. A stage that can
 `flush` takes a frame when the next one is there, or none will come: so it can flush with the last frame.
 
-A sink may `prepare` items one by one, which any worker does as soon as
-an item is there. The engine then keeps what it returned in place of the item.
+A sink may `prepare` items one by one, which any worker does as soon as an item is there. The engine then keeps what it
+returned in place of the item.
 """
 
 from __future__ import annotations
@@ -100,7 +100,9 @@ class Engine:
     ) -> None:
         self._ledger, self._on_frame = ledger, on_frame
         self._capacity, self._max_large = capacity, max(1, workers // 2)
-        self._condition = threading.Condition()
+        lock = threading.RLock()
+        self._condition, self._caller = threading.Condition(lock), threading.Condition(lock)  # workers; the caller
+        self._fits: Callable[[], bool] = lambda: False  # whether what `admit` waits with has room
         self._frames: deque[_Frame] = deque()
         self.states = start(stages) | dict(states or {})  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
@@ -142,13 +144,12 @@ class Engine:
         begun = time.perf_counter()
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
-            while len(self._frames) >= self._max_frames or not self._has_room(first, frame):
+            self._fits = lambda: len(self._frames) < self._max_frames and self._has_room(first, frame)
+            while self.failure or not self._fits():
                 if self.failure or stop():
                     return False
-                self._condition.wait(0.1)
+                self._caller.wait(0.1)
             self.waiting += time.perf_counter() - begun
-            if self.failure:
-                return False
             self.admitted += 1
             self._frames.append(frame)
             self._free(frame, tuple(values))
@@ -167,11 +168,11 @@ class Engine:
             self._ending = True
             self._condition.notify_all()
             while self._frames and not self.failure and not stop():
-                self._condition.wait(0.1)
+                self._caller.wait(0.1)
             self._closed = True
             self._condition.notify_all()
             while self._writing:
-                self._condition.wait(0.1)
+                self._caller.wait(0.1)
         for thread in self._threads:
             while thread.is_alive() and not stop():
                 thread.join(0.1)
@@ -209,12 +210,15 @@ class Engine:
     def _work_loop(self) -> None:
         while True:
             with self._condition:
-                task = self._next_task()
-                while task is None:
+                while True:
+                    task = self._next_task()
+                    if self.failure or self._ending or self._fits():
+                        self._caller.notify()  # only then: a wake-up for each result costs as much as reading
+                    if task is not None:
+                        break
                     if self._closed or self.failure:
                         return
                     self._condition.wait()
-                    task = self._next_task()
             work, frame = task
             seconds, cpu = time.perf_counter(), time.thread_time()
             try:
@@ -387,11 +391,7 @@ class Engine:
     @staticmethod
     def _preparing(sink: str, prepare: Callable[[str, Any], Any], stream: str, key: str) -> _Work:
         """The work that prepares the items of one stream for a sink; it stores them under `key`."""
-
-        def run(frame: _Frame) -> Any:
-            return prepare(stream, frame.values[stream])
-
-        return _Work(key, (stream,), (stream,), key, False, run, sink=sink)
+        return _Work(key, (stream,), (stream,), key, False, lambda f: prepare(stream, f.values[stream]), sink=sink)
 
 
 def _missing(values: Iterable[Any]) -> Absent | Unchanged | None:
