@@ -69,6 +69,7 @@ class Canvas:
     _present: dict[str, set[int]] = field(default_factory=dict)
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
+    _recurred: dict[str, tuple[rr.DescribedComponentBatch, ...]] = field(default_factory=dict)
     _veiled: set[str] = field(default_factory=set)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
@@ -79,11 +80,21 @@ class Canvas:
         for view in views:
             self.add_view(view)
 
-    def _log(self, path: str, kind: type, components: Sequence[rr.DescribedComponentBatch]) -> None:
+    def _log(
+        self,
+        path: str,
+        kind: type,
+        content: Sequence[rr.DescribedComponentBatch],
+        recurring: tuple[rr.DescribedComponentBatch, ...] = (),
+    ) -> None:
+        """Log an entity. What recurs is left out while it is that of the last frame, which the viewer then takes."""
+        logged = self._recurred.get(path, ()) if path in self._before else ()
+        components = [*content, *(batch for batch in recurring if not any(batch is other for other in logged))]
+        self._recurred[path] = recurring
         rr.log(path, components, recording=self.recording)
         self._now[path] = kind
         if self.counts_bytes:
-            self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in components)
+            self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in (*content, *recurring))
 
     def add_view(self, view: ViewSpec) -> None:
         """Add a view to the blueprint."""
@@ -155,8 +166,15 @@ class Canvas:
 
     def log_blob(self, path: str, kind: type, blob: bytes | Array, view: ViewSpec, **fields: Any) -> None:
         """An image that is encoded already, and the other fields of its archetype, which recur."""
-        self._log(path, kind, [_content(kind, "blob", blob), *_recurring(kind, **fields)])
+        self._log(path, kind, [_content(kind, "blob", blob)], _recurring(kind, **fields))
         self.add_view(view)
+
+    def _log_raw(
+        self, path: str, kind: type, pixels: Array, recurring: tuple[rr.DescribedComponentBatch, ...] = ()
+    ) -> None:
+        """Log an image that is not encoded."""
+        form = _image_format(kind, pixels.shape, pixels.dtype)
+        self._log(path, kind, [_content(kind, "buffer", pixels)], (*form, *recurring))
 
     def log_values(
         self,
@@ -174,11 +192,11 @@ class Canvas:
         low, high = limits
         ends = (low - 0.1 * (high - low), high)
         colours = _recurring(rr.DepthImage, meter=1.0, colormap=VIEWER_COLORMAPS[palette])
-        self._log(view.path, rr.DepthImage, [*_raw(rr.DepthImage, values), *colours, _depth_range(ends)])
+        self._log_raw(view.path, rr.DepthImage, values, (*colours, _depth_range(ends)))
         self.add_view(view)
         if palette != cv2.COLORMAP_TURBO:  # which begins with nearly black
-            mask = _raw(rr.SegmentationImage, np.isnan(values).view(np.uint8))
-            self._log(f"{view.path}/unknown", rr.SegmentationImage, [*mask, *_masking("unknown", UNKNOWN_RGB)])
+            mask = np.isnan(values).view(np.uint8)
+            self._log_raw(f"{view.path}/unknown", rr.SegmentationImage, mask, _masking("unknown", UNKNOWN_RGB))
         if unit is not None:
             self.log_legend(f"{view.path}/scale", values.shape, _scale(low, high, unit, palette, hazard))
 
@@ -204,8 +222,8 @@ class Canvas:
         name, faint = veiled
         if faint is not None and (faint.any() or view.path in self._veiled):
             self._veiled.add(view.path)
-            mask = _raw(rr.SegmentationImage, np.ascontiguousarray(faint).view(np.uint8))
-            self._log(f"{view.path}/{name}", rr.SegmentationImage, [*mask, *_masking(name, VEIL)])
+            mask = np.ascontiguousarray(faint).view(np.uint8)
+            self._log_raw(f"{view.path}/{name}", rr.SegmentationImage, mask, _masking(name, VEIL))
         entries = [(name, VEIL[:3])] if view.path in self._veiled and faint is not None else []
         self.log_legend(f"{view.path}/scale", steps.shape, [*_scale(0.0, limit, unit, palette), *entries])
 
@@ -219,7 +237,7 @@ class Canvas:
             names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
             self.recording.log(path, rr.AnnotationContext(names), static=True)
         labels = codes.astype(np.uint8, copy=False)
-        self._log(f"{path}/labels", rr.SegmentationImage, _raw(rr.SegmentationImage, labels))
+        self._log_raw(f"{path}/labels", rr.SegmentationImage, labels)
         self.add_view(view)
         counts = label_counts(labels) if counts is None else counts
         present = self._present.setdefault(path, set())  # codes of any frame so far, so that the legend stays
@@ -293,25 +311,20 @@ def _recurring(kind: Any, **fields: Any) -> tuple[rr.DescribedComponentBatch, ..
 
 
 @cache
-def _masking(name: str, color: tuple[int, ...]) -> list[rr.DescribedComponentBatch]:
+def _masking(name: str, color: tuple[int, ...]) -> tuple[rr.DescribedComponentBatch, ...]:
     """How a mask is drawn: 1 in a colour, 0 not at all."""
     labels = [
         rr.AnnotationInfo(id=0, label="known", color=(0, 0, 0, 0)),
         rr.AnnotationInfo(id=1, label=name, color=color),
     ]
     opaque = _recurring(rr.SegmentationImage, opacity=1.0)
-    return [*opaque, *rr.AnnotationContext(labels).as_component_batches()]
+    return (*opaque, *rr.AnnotationContext(labels).as_component_batches())
 
 
 @lru_cache(maxsize=256)
 def _image_format(kind: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[rr.DescribedComponentBatch, ...]:
     batches = kind(np.zeros(shape, dtype)).as_component_batches()
     return tuple(batch for batch in batches if batch.component_descriptor().component.endswith(":format"))
-
-
-def _raw(kind: Any, pixels: Array) -> list[rr.DescribedComponentBatch]:
-    """An image that is not encoded."""
-    return [_content(kind, "buffer", pixels), *_image_format(kind, pixels.shape, pixels.dtype)]
 
 
 def _content(kind: Any, field: str, content: bytes | Array) -> rr.DescribedComponentBatch:
@@ -323,6 +336,7 @@ def _content(kind: Any, field: str, content: bytes | Array) -> rr.DescribedCompo
     return rr.DescribedComponentBatch(rr.components.BlobBatch(blob), empty.component_descriptor())
 
 
+@lru_cache(maxsize=256)
 def _depth_range(ends: tuple[float, float]) -> rr.DescribedComponentBatch:
     (like,) = _recurring(rr.DepthImage, depth_range=(0.0, 1.0))
     stored = pa.FixedSizeListArray.from_arrays(np.array(ends, np.float64), type=like.as_arrow_array().type)
