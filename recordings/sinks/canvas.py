@@ -6,6 +6,7 @@ viewer never shows an old picture as this frame's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, lru_cache
@@ -63,6 +64,7 @@ class Canvas:
     views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
     camera: StereoCamera | None = None
     ways: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # frame -> x and y of the poses so far
+    numbers: dict[str, float] = field(default_factory=dict)  # path -> value of the frame, NaN where it has none
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _texts: dict[str, str] = field(default_factory=dict)
     _legends: dict[str, Legend] = field(default_factory=dict)
@@ -121,7 +123,8 @@ class Canvas:
             self.name_curves(
                 f"{CURVES}/{view.panel.name}", [name.rpartition("/")[2].replace("\\", "") for name in drawn]
             )
-        self.log(path, rr.Scalars(float(value)), view)
+        self.numbers[path], self._now[path] = float(value), rr.Scalars
+        self.add_view(view)
 
     def name_curves(self, path: str, names: Sequence[str]) -> None:
         """Log the names of curves below each other, in the colours of `CURVE_RGB`."""
@@ -285,6 +288,9 @@ class Canvas:
         """Clear the entities of the last frame that this frame lacks."""
         for path, kind in self._before.items():
             if path in self._now:
+                continue
+            if issubclass(kind, rr.Scalars):
+                self.numbers[path] = math.nan
                 continue
             if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
                 # The viewer goes on showing a cleared encoded image (rerun-io/rerun#12793), but not an empty one.

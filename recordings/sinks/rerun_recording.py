@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -44,12 +44,21 @@ from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
-PLOT_BATCH = 32  # frames whose stage times and queues are sent at once
+PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers and lines are sent at once, without and with a viewer
 BATCH_BYTES = 1 << 19  # that one entity waits with; each stored chunk takes 3 kB besides its content
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
 FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
+
+
+class _Note(NamedTuple):
+    """Numbers of a frame by their paths, and its text in the ledger."""
+
+    stamp: int
+    frame: int
+    values: dict[str, float]
+    lines: list[str]
 
 
 class RerunRecording:
@@ -66,7 +75,7 @@ class RerunRecording:
         self._viewer: Follower | None = None
         self._stamp = 0  # the latest, ns
         self._frames, self._views = 0, -1
-        self._plots: list[tuple[int, int, dict[str, float]]] = []  # per frame: stamp, number, path -> value
+        self._notes: list[_Note] = []  # of frames, not sent yet
         self._work = Counter[str]()  # stage -> seconds of all frames
         with writing(self._path):
             self._partial.open("wb").close()
@@ -120,11 +129,8 @@ class RerunRecording:
             for stream in record.unchanged:
                 self._canvas.keep_all(stream)
             captions = self._draw(record.items)
-            self._plot(record)
             self._canvas.clear_missing()
-            text = "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions])
-            for line in lines_of(text):
-                self._recording.log(FRAMES, rr.TextLog(line, level=rr.TextLogLevel.INFO))
+            self._note(record, "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions]))
             self._log_losses(record.entries, self._frames)
             self._send_blueprint()
             if self._viewer is not None:
@@ -157,7 +163,7 @@ class RerunRecording:
 
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Log the verdict, the remaining losses and the findings."""
-        self._send_plots()
+        self._send_notes()
         verdict = str(summary.get("verdict", "INCOMPLETE"))
         last = max(0, self._frames - 1)
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
@@ -231,9 +237,10 @@ class RerunRecording:
                     captions.append(log(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
         return [caption for caption in captions if caption]
 
-    def _plot(self, record: FrameRecord) -> None:
-        """Keep stage times and queues, to send many frames at once: sent one by one they would be half of all calls."""
-        values = {}
+    def _note(self, record: FrameRecord, text: str) -> None:
+        """Keep the numbers and the line of a frame, to send many frames at once: one by one they would be half of all
+        calls."""
+        values, self._canvas.numbers = self._canvas.numbers, {}
         self._work.update(record.seconds)
         for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
             for stage, number in numbers.items():
@@ -242,19 +249,27 @@ class RerunRecording:
                 if root == QUEUES and (Panel.STAGE, view.path) not in self._canvas.views:
                     self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
                 self._canvas.add_view(view)
-        self._plots.append((record.stamp, self._frames, values))
-        if len(self._plots) == PLOT_BATCH:
-            self._send_plots()
+        self._notes.append(_Note(record.stamp, self._frames, values, lines_of(text)))
+        if len(self._notes) >= (PLOT_BATCH if self._viewer is None else LIVE_BATCH):
+            self._send_notes()
 
-    def _send_plots(self) -> None:
-        """Send the kept numbers; a frame without a stage has a gap in its line."""
-        if not self._plots:
-            return
-        stamps, frames, kept = zip(*self._plots, strict=True)
-        self._plots, clocks = [], _clocks(stamps, frames)
-        for path in [view.path for view in self._canvas.views.values() if view.panel is Panel.STAGE]:
-            columns = rr.Scalars.columns(scalars=[values.get(path, math.nan) for values in kept])
-            self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
+    def _send_notes(self) -> None:
+        """Send the kept numbers and lines; a frame without a stage has a gap in its line."""
+        notes, self._notes = self._notes, []
+        stages = {view.path: None for view in self._canvas.views.values() if view.panel is Panel.STAGE} if notes else {}
+        for path in stages | {path: None for note in notes for path in note.values}:
+            these = notes if path in stages else [note for note in notes if path in note.values]
+            columns = rr.Scalars.columns(scalars=[note.values.get(path, math.nan) for note in these])
+            self._send(path, these, columns)
+        lines = [(note, line) for note in notes for line in note.lines]
+        if lines:
+            levels = [rr.TextLogLevel.INFO] * len(lines)
+            columns = rr.TextLog.columns(text=[line for _, line in lines], level=levels)
+            self._send(FRAMES, [note for note, _ in lines], columns)
+
+    def _send(self, path: str, notes: Sequence[_Note], columns: rr.ComponentColumnList) -> None:
+        clocks = _clocks([note.stamp for note in notes], [note.frame for note in notes])
+        self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
 
     def _log_losses(self, entries: Iterable[Loss], frame: int) -> None:
         """Losses, at their own stamps on the log's clock."""
