@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +12,13 @@ from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy
 from stages.data import Array, Cell, NavigationMap
 
 Measures = dict[str, float]
-Layers = Mapping[str, Array]
 _CELLS = {Cell.UNKNOWN: "unknown", Cell.FREE: "free", Cell.HAZARD: "hazard"}
 
 
-class _Grid(NamedTuple):
-    """Where a grid lies: (x, y) of its lower-left corner and the size of its cells, m."""
+class GridLayers(NamedTuple):
+    """Layers, (rows, cols) each; (x, y) of their grid's lower-left corner, m; the size of its cells, m."""
 
+    layers: Mapping[str, Array]
     origin: tuple[float, float]
     resolution: float
 
@@ -31,31 +32,49 @@ def measures(schema: str, one: Any, other: Any) -> Measures:
     return {} if measure is None else {name: value for name, value in measure(one, other).items() if value}
 
 
-def side_by_side(one: Layers, other: Layers, grids: Sequence[Any]) -> dict[str, tuple[Array, Array]]:
-    """The layers that two grids of one resolution share, each on the smallest grid that contains both.
+def on_one_grid(one: GridLayers, other: GridLayers) -> tuple[GridLayers, GridLayers]:
+    """The layers that two grids share, float32, on the smallest grid that contains both, with the smaller cells.
 
-    grids: the two grids (`origin`, `resolution`), whose layers `one` and `other` are. Cells outside are NaN.
+    Cells outside are NaN.
     """
-    first = [tuple(round(value / grid.resolution) for value in grid.origin[::-1]) for grid in grids]
-    shapes = [next(iter(layers.values())).shape for layers in (one, other)]
-    low = np.min(first, axis=0)
-    high = np.max([np.add(start, shape) for start, shape in zip(first, shapes, strict=True)], axis=0)
+    step = min(one.resolution, other.resolution)
+    low = np.minimum(one.origin, other.origin)
+    high = np.maximum(*(np.add(grid.origin, np.multiply(_shape(grid)[::-1], grid.resolution)) for grid in (one, other)))
+    columns, rows = (np.arange(round(length)) for length in (high - low) / step)
 
-    def placed(layer: Array, start: tuple[int, ...]) -> Array:
-        whole = np.full(high - low, np.nan, np.float32)
-        row, col = np.subtract(start, low)
-        whole[row : row + layer.shape[0], col : col + layer.shape[1]] = layer
-        return whole
+    def placed(grid: GridLayers) -> GridLayers:
+        places = [
+            np.floor((start + (cells + 0.5) * step - origin) / grid.resolution).astype(int)
+            for start, cells, origin in zip(low[::-1], (rows, columns), grid.origin[::-1], strict=True)
+        ]
+        inside = [(place >= 0) & (place < size) for place, size in zip(places, _shape(grid), strict=True)]
+        layers = {}
+        for name in (name for name in one.layers if name in other.layers):
+            layers[name] = np.full((rows.size, columns.size), np.nan, np.float32)
+            known = np.ix_(*(place[within] for place, within in zip(places, inside, strict=True)))
+            layers[name][np.ix_(*inside)] = grid.layers[name][known]
+        return GridLayers(layers, (float(low[0]), float(low[1])), step)
 
-    names = [name for name in one if name in other]
-    return {name: (placed(one[name], first[0]), placed(other[name], first[1])) for name in names}
+    return placed(one), placed(other)
 
 
-def cells(one: NavigationMap, other: NavigationMap) -> tuple[Array, Array]:
-    """The cells of two maps on one grid, codes of `Cell`."""
-    first, second = ({"cells": grid.cells.astype(np.float32)} for grid in (one, other))
-    found = side_by_side(first, second, (one, other))["cells"]
-    return tuple(np.where(np.isnan(part), Cell.UNKNOWN, part).astype(np.int8) for part in found)  # type: ignore[return-value]
+def _shape(grid: GridLayers) -> tuple[int, ...]:
+    return next(iter(grid.layers.values())).shape
+
+
+def verdicts_on_one_grid(one: NavigationMap, other: NavigationMap) -> tuple[NavigationMap, NavigationMap]:
+    """Two maps on the smallest grid that contains both, with the smaller cells and without reasons."""
+    grids = [
+        GridLayers({"cells": grid.cells.astype(np.float32)}, grid.origin, grid.resolution) for grid in (one, other)
+    ]
+
+    def placed(grid: NavigationMap, on: GridLayers) -> NavigationMap:
+        cells = np.where(np.isnan(on.layers["cells"]), Cell.UNKNOWN, on.layers["cells"]).astype(np.int8)
+        reason = np.zeros(cells.shape, np.uint8)
+        return replace(grid, cells=cells, reason=reason, origin=on.origin, resolution=on.resolution)
+
+    first, second = on_one_grid(*grids)
+    return placed(one, first), placed(other, second)
 
 
 def _disparities(one: Any, other: Any) -> Measures:
@@ -70,22 +89,23 @@ def _maps(one: Any, other: Any) -> Measures:
     grids = [_grid_of(message) for message in (one, other)]
     if grids[0].resolution != grids[1].resolution:
         return {"maps of other resolution": 1.0}
-    layers = side_by_side(read_layers(one), read_layers(other), grids)
-    heights = layers.pop("elevation", None)
-    found = {} if heights is None else _changes(*heights, "cells", "cm", 100.0)
-    return found | {f"cells of layer {name}": float(np.sum(_differ(*pair))) for name, pair in layers.items()}
+    first, second = (grid.layers for grid in on_one_grid(*grids))
+    found = _changes(first["elevation"], second["elevation"], "cells", "cm", 100.0) if "elevation" in first else {}
+    others = (name for name in first if name != "elevation")
+    return found | {f"cells of layer {name}": float(np.sum(_differ(first[name], second[name]))) for name in others}
 
 
-def _grid_of(message: Any) -> _Grid:
+def _grid_of(message: Any) -> GridLayers:
     info, centre = message.info, message.info.pose.position
-    return _Grid((centre.x - info.length_x / 2, centre.y - info.length_y / 2), float(info.resolution))
+    origin = (centre.x - info.length_x / 2, centre.y - info.length_y / 2)
+    return GridLayers(read_layers(message), origin, float(info.resolution))
 
 
 def _verdicts(one: Any, other: Any) -> Measures:
     grids = read_occupancy_grid(one), read_occupancy_grid(other)
     if grids[0].resolution != grids[1].resolution:
         return {"maps of other resolution": 1.0}
-    first, second = cells(*grids)
+    first, second = (grid.cells for grid in verdicts_on_one_grid(*grids))
     return {
         f"cells from {name} to {_CELLS[after]}": float(np.sum((first == before) & (second == after)))
         for before, name in _CELLS.items()

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from recordings.comparison.measures import GridLayers, on_one_grid, verdicts_on_one_grid
 from recordings.export.page_layout import add_bar, add_legend, map_page, page_of, with_rover
 from recordings.export.png_pages import disparity_page, relief_page, verdict_page
 from recordings.png import png
@@ -69,8 +70,10 @@ def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array] | None:
 
 
 def _elevations(one: Any, other: Any) -> tuple[Array, Array, Array]:
-    first, second = _on_one_grid(*(colormaps.terrain_ahead(read_grid_map(message)) for message in (one, other)))
-    heights = [grid.layers["elevation"] for grid in (first, second)]
+    maps = [colormaps.terrain_ahead(read_grid_map(message)) for message in (one, other)]
+    grids = on_one_grid(*(GridLayers(item.layers, item.origin, item.resolution) for item in maps))
+    first, second = (replace(item, **grid._asdict()) for item, grid in zip(maps, grids, strict=True))
+    heights = [grid.layers["elevation"] for grid in grids]
     limits = colormaps.elevation_limits(np.concatenate([layer.ravel() for layer in heights]))
     page = _map(_change_colors(heights[0], heights[1], HEIGHT_LIMIT), first, "change from A, m")
     add_bar(page, -HEIGHT_LIMIT, HEIGHT_LIMIT, lambda values: signed_colors(values, HEIGHT_LIMIT), ONLY_ONE)
@@ -78,9 +81,8 @@ def _elevations(one: Any, other: Any) -> tuple[Array, Array, Array]:
 
 
 def _verdicts(one: Any, other: Any) -> tuple[Array, Array, Array]:
-    first, second = _on_one_grid(
-        *(colormaps.navigation_ahead(read_occupancy_grid(message)) for message in (one, other))
-    )
+    maps = (colormaps.navigation_ahead(read_occupancy_grid(message)) for message in (one, other))
+    first, second = verdicts_on_one_grid(*maps)
     before, after = first.cells, second.cells
     codes = np.select([before == after, after == Cell.FREE, after == Cell.HAZARD], [0, 1, 2], 3)
     page = _map(colormaps.legend_colors(codes, FLIPS), first, "change from A")
@@ -94,37 +96,6 @@ def _change_colors(one: Array, other: Array, limit: float) -> Array:
     for code, known in ((1, np.isfinite(one) & np.isnan(other)), (2, np.isnan(one) & np.isfinite(other))):
         rgb[known] = ONLY_ONE[code][1]
     return rgb
-
-
-def _on_one_grid(one: Any, other: Any) -> tuple[Any, Any]:
-    """Two elevation maps, or two navigation maps, on the smallest grid that contains both, with the smaller cells."""
-    step = min(one.resolution, other.resolution)
-    low = np.minimum(one.origin, other.origin)
-    high = np.maximum(*(np.add(grid.origin, np.array(_shape(grid)[::-1]) * grid.resolution) for grid in (one, other)))
-    columns, rows = (np.arange(round(length)) for length in (high - low) / step)
-
-    def placed(grid: Any, layer: Array, unknown: float) -> Array:
-        places = [
-            np.floor((start + (cells + 0.5) * step - origin) / grid.resolution).astype(int)
-            for start, cells, origin in zip(low[::-1], (rows, columns), grid.origin[::-1], strict=True)
-        ]
-        inside = [(place >= 0) & (place < size) for place, size in zip(places, layer.shape, strict=True)]
-        whole = np.full((rows.size, columns.size), unknown, layer.dtype)
-        whole[np.ix_(*inside)] = layer[np.ix_(*(place[known] for place, known in zip(places, inside, strict=True)))]
-        return whole
-
-    def extended(grid: Any) -> Any:
-        place: dict[str, Any] = {"resolution": step, "origin": (float(low[0]), float(low[1]))}
-        if isinstance(grid, ElevationMap):
-            return replace(grid, layers={"elevation": placed(grid, grid.layers["elevation"], np.nan)}, **place)
-        cells = placed(grid, grid.cells, Cell.UNKNOWN)
-        return replace(grid, cells=cells, reason=np.zeros(cells.shape, np.uint8), **place)
-
-    return extended(one), extended(other)
-
-
-def _shape(grid: ElevationMap | NavigationMap) -> tuple[int, ...]:
-    return grid.shape if isinstance(grid, ElevationMap) else grid.cells.shape
 
 
 def _map(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Array:
