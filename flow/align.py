@@ -17,7 +17,7 @@ from statistics import median_low
 from typing import Any
 
 from flow.contracts import Absent, Loss, LossReason
-from flow.parameters import check_parameters, parameter
+from flow.parameters import Checked, parameter
 from flow.runtime.graph import hints_of
 from flow.runtime.ledger import failure
 
@@ -56,7 +56,7 @@ def _time(nanoseconds: int) -> str:
 
 
 @dataclass(frozen=True)
-class Pair:
+class Pair(Checked):
     """Joins two streams of the same rate into pairs, by the left item's `pair_with(right)`.
 
     Partners are the first two unpaired messages whose stamps differ by at most `slop`, which must be less than half the
@@ -69,9 +69,6 @@ class Pair:
 
     ports = ("left", "right")
     clock = None  # pairs are a clock of their own
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     @staticmethod
     def output(kinds: dict[str, type]) -> type:
@@ -154,15 +151,12 @@ class PairState:
 
 
 @dataclass(frozen=True)
-class _Sampler:
+class _Sampler(Checked):
     """Samples `stream` at the stamps of `at`; its tokens run on the clock of `at`."""
 
     ports = ("stream", "at")
     clock = "at"
     patience: int
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples."""

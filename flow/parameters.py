@@ -54,6 +54,13 @@ def check_parameters(item: Any) -> None:
                 raise ValueError(f"{type(item).__name__}.{known.name} {error}") from None
 
 
+class Checked:
+    """Base of dataclasses whose parameters are checked when an object is made."""
+
+    def __post_init__(self) -> None:
+        check_parameters(self)
+
+
 def check(value: Any, known: Field[Any], given: Any = None) -> None:
     """Raise ValueError, "must be ...", for a value that the parameter `known` does not take.
 

@@ -9,7 +9,7 @@ from dataclasses import Field, dataclass
 from typing import Any
 
 from flow.contracts import StageError
-from flow.parameters import check_parameters
+from flow.parameters import Checked
 from flow.parameters import parameter as parameter
 from stages.data import LEVEL_FRAME, Disparity, PointCloud, StereoFrame
 
@@ -17,7 +17,7 @@ MAX_CELLS = 4000  # cells, of a map
 
 
 @dataclass(frozen=True)
-class Stage:
+class Stage(Checked):
     """Base of the stages: a frozen dataclass whose fields are its parameters and whose `__call__` is the work.
 
     The docstring of a subclass gets a section Parameters, made from all fields, for `help()`.
@@ -30,9 +30,6 @@ class Stage:
         if cls.__doc__ and rows and "Parameters\n---" not in cls.__doc__:
             sections = re.split(r"\n\n(?=\w+\n---)", inspect.cleandoc(cls.__doc__))
             cls.__doc__ = "\n\n".join([sections[0], "\n".join(["Parameters", "----------", *rows]), *sections[1:]])
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
 
 def _is_parameter(item: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import Any, get_type_hints
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flow.parameters import check_parameters, coerced, parameter
+from flow.parameters import Checked, coerced, parameter
 from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
 from recordings.importers.recording import BASE, LEFT
@@ -29,7 +29,7 @@ _COLUMN: dict[str, Any] = {"low": 2, "high": 1000}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rig:
+class Rig(Checked):
     """The entries of a rig file. A camera without turns looks straight ahead; base_link is on the ground below it."""
 
     height: float | None = parameter(None, "height of the left camera above base_link", unit="m", low=0.0, high=1e9)
@@ -58,9 +58,6 @@ class Rig:
         choices=("axis", "euler"),
     )  # fmt: skip
     where: str = field(default="", init=False)
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     def need(self, kind: str, *names: str) -> None:
         """Raise LogError if one of the entries is missing that the data set does not say."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from recordings.inertial.blocks import BLOCK_NS, Blocks
 from stages.data import Array
+from stages.data.covariance import cross_matrix
 
 # Of common MEMS sensors; rates in rad/s, accelerations in m/s^2, densities for 1 Hz.
 GYROSCOPE_NOISE = 5e-4
@@ -150,8 +151,8 @@ def _predicted(state: GravityState, blocks: Blocks, at: int, bias: Array) -> tup
     force, seconds = state.mean[S], blocks.seconds[at]
     drift = blocks.turned[at] @ (state.mean[B] - bias)
     transition = np.eye(9)
-    transition[S, S] += _cross(drift)
-    transition[S, B] = -_cross(force) @ blocks.turned[at]
+    transition[S, S] += cross_matrix(drift)
+    transition[S, B] = -cross_matrix(force) @ blocks.turned[at]
     mean = state.mean.copy()
     mean[S] += np.cross(drift, force)
     noise = np.zeros((9, 9))
@@ -173,9 +174,3 @@ def _updated(state: GravityState, model: Array, measured: Array, variance: float
     rest = np.eye(9) - gain @ model
     covariance = rest @ state.covariance @ rest.T + gain @ noise @ gain.T
     return GravityState(state.mean + gain @ off, (covariance + covariance.T) / 2)
-
-
-def _cross(vector: Array) -> Array:
-    """The matrix of the cross product with a vector."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

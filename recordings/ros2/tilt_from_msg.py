@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from flow.parameters import check_parameters, parameter
+from flow.parameters import Checked, check_parameters, parameter
 from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
 from recordings.ros2.from_msg import frame_of, pose_of, stamp_or, unit_quaternion
@@ -116,15 +116,12 @@ def _sigma_of(covariance: bytes) -> float | None:
 
 
 @dataclass(frozen=True)
-class AngleField:
+class AngleField(Checked):
     """An angle in a message: the path of its field, its unit and its sign."""
 
     field: str = parameter(MISSING, "path of the field in the message, such as vector.x")
     unit: str = parameter(MISSING, "unit of its numbers", choices=("deg", "rad"))
     sign: int = parameter(MISSING, "1: positive is nose up (pitch) or left side up (roll)", choices=(1, -1))
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
     def __call__(self, message: Any) -> float:
         """The angle in radians, with our sign."""

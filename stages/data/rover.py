@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from flow.parameters import check_parameters, parameter
+from flow.parameters import Checked, parameter
 
 
 @dataclass(frozen=True)
-class Rover:
+class Rover(Checked):
     """The vehicle's body and its limits; the stages that need it share one value.
 
     Examples
@@ -26,6 +26,3 @@ class Rover:
     max_slope: float = parameter(
         math.radians(20), "steepest ground that is not a hazard", unit="rad", low=0.0, high=math.radians(89)
     )
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
