@@ -127,6 +127,9 @@ def class_at(use: str, place: YamlLocation) -> type:
         raise place.error(f"cannot import '{module_name}': {failure(error.with_traceback(trace))}") from error
     kind = getattr(module, name, None)
     if isinstance(kind, type) and is_dataclass(kind):
+        if any(isinstance(value, Field) for value in vars(kind).values()):  # a base is a dataclass
+            frozen = "(frozen=True)" * kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
+            raise place.error(f"{use} has parameters, but is no dataclass; decorate it with @dataclass{frozen}")
         return kind
     if hasattr(module, name):
         raise place.error(f"{use} is no dataclass; decorate it with @dataclass")

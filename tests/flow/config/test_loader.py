@@ -268,6 +268,8 @@ def own(field="int", takes="couple: Couple", returns="Couple"):
     (IDLE, ADD, "Own", "6: 'sum' has no input"),
     (ODD, ADD, "Own, a: twice, b: height", "6: KeyError: 'nix' (MODULE.py, line 7; --debug"),
     (PLAIN, SCALE, "Own", "5: MODULE.Own is no dataclass; decorate"),
+    (IMPORTS + "class Own(Scale):\n    more: int = field(default=0)\n", SCALE, "Own, couple: both",
+     "5: MODULE.Own has parameters, but is no dataclass; decorate it with @dataclass(frozen=True)"),
     (PLAIN + "def function(): ...\n", SCALE, "function", "5: MODULE.function is no dataclass; decorate"),
 ])  # fmt: skip
 def test_a_mistake_in_a_module_of_ones_own_is_named_with_its_line(tmp_path, source, replaced, entry, message):
