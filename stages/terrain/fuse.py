@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from flow.contracts import Finding, Severity, StageError, counted
-from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Region, Transform
+from stages.data import Array, ElevationMap, Mount, PointCloud, Pose, Region, Transform
 from stages.data.tiles import put, taken
-from stages.stage import Stage, check_cells, parameter
+from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.fused_map import FusedMap, Observation, cells_of, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
@@ -60,7 +60,7 @@ class _Fusion(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_cells("Fuse.max_range", self.max_range, self.resolution, 2)
+        check_cells(f"{type(self).__name__}.max_range", self.max_range, self.resolution, 2)
 
     def start(self) -> FusedMap:
         """An empty map, the state of one run."""
@@ -144,10 +144,9 @@ class _Fusion(Stage):
         return Finding(" ".join(found), Severity.WARNING, assumes="tilt") if found else None
 
     def _check(self, cloud: PointCloud, state: FusedMap) -> None:
-        if cloud.frame_id != LEVEL_FRAME or cloud.sensor is None:
-            raise StageError(
-                f"Fuse: the cloud is in frame '{cloud.frame_id}', not '{LEVEL_FRAME}'; put stages.Level before it"
-            )
+        check_level(self, cloud)
+        if cloud.sensor is None:
+            raise StageError("Fuse: the cloud lacks its camera's place, `sensor`; stages.Level adds it")
         if cloud.stamp <= state.last and state.logged is None:
             raise StageError(f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns")
 

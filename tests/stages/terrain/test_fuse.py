@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from flow.contracts import StageError
-from stages import Binarise, Cell, Fuse, PixelOrigin, TerrainFeatures
+from stages import Binarise, Cell, Fuse, FuseRegion, PixelOrigin, TerrainFeatures
 from stages.data.tiles import Tiles
 from stages.terrain.fused_map import SHARED_SHARE
 from stages.terrain.map_registration import frame_grid, register
@@ -274,6 +274,11 @@ def test_a_map_of_a_log_is_not_continued_from_another_place():
 def test_a_window_smaller_than_a_frame_is_refused():
     with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
         Fuse(max_range=8.0, window=15.0)
+
+
+def test_a_range_of_too_many_cells_is_refused_by_its_own_name():
+    with pytest.raises(ValueError, match=r"^FuseRegion\.max_range = 150 m makes a map 6000 cells"):
+        FuseRegion(max_range=150.0)
 
 
 TRACK = """
