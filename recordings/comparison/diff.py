@@ -233,6 +233,8 @@ def _facts(one: Mapping[str, str], other: Mapping[str, str]) -> dict[str, tuple[
     if "pipeline" in found:
         before, after = (text.splitlines() for text in found["pipeline"])
         changed = [line for line in unified_diff(before, after, n=0) if not line.startswith(("---", "+++", "@@"))]
-        removed, added = ("\n".join(line[1:].strip() for line in changed if line[0] == sign) for sign in "-+")
+        removed, added = (
+            "\n".join(line[1:] for line in changed if line[0] == sign and line[1:].strip()) for sign in "-+"
+        )
         found["pipeline"] = (removed, added)
     return found
