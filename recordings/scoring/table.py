@@ -18,7 +18,7 @@ ROWS = (
     "levelled height RMSE, cm: 0-4 m; 4-8 m",
     "visible cells with a value; of these within 5 cm (levelled), %",
     "hallucinated values (no camera could see their cells), % of values",
-    "cells that no pixel hits, % of values: all; not interpolated",
+    "values in cells that no pixel hits, %: all; not interpolated",
     "levelled errors within 1; 2 stated random sigmas (ideal 68; 95), %",
     "raw errors within 1; 2 stated total sigmas (ideal 68; 95), %",
     "detected rocks, at least half visible: 0.2 m; 0.3 m and higher",
@@ -114,8 +114,8 @@ def _disparity_lines(d: dict[str, Any]) -> list[str]:
     share_hidden, bad = _percent(hidden["share"]), _percent(hidden["bad_2"])
     limits = "".join(f"{f'bad-{limit:g}':>8}" for limit in THRESHOLDS)
     return [
-        "disparity    bad-T: share wrong by over T px, or unknown; mean and RMS error of the known, px",
-        f"               whole image       pixels    known |{limits} |    mean     RMS",
+        "disparity    bad-T: share wrong by over T px, or unknown; MAE and RMS error of the known, px",
+        f"               whole image       pixels    known |{limits} |     MAE     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
         *(_region_line(name, m) for name, m in d.get("by_surface", {}).items() if m["pixels"]),
         *(_known_line(name, d["whole_image"][name]) for name in ("nonocc", "all")),
