@@ -46,7 +46,7 @@ def refusal_of(graph: Graph, log: McapLog) -> str:
 def advice(options: Namespace, description: Mapping[str, Any], graph: Graph) -> list[str]:
     """The command that runs the log, its time and the sizes of its outputs, and a search range if another is needed."""
     pipeline = [] if options.pipeline == "rover" else ["-p", options.pipeline]
-    changes = [f"--set={change}" for change in options.set]
+    changes = [part for change in options.set for part in ("--set", change)]
     lines = [f"  {shlex.join(['roverflow', 'run', *map(str, options.log), *pipeline, *changes])}"]
     if line := _costs(options.pipeline, description):
         lines.append(f"  {line}; it writes {default_result(options.log).name} beside the log")
@@ -62,11 +62,7 @@ def remedies(description: Mapping[str, Any]) -> list[str]:
         if description["missing"][stream] in description["refused"]
         for remedy in known[stream]
     ]
-    lines = [
-        f"  {shlex.join(f'--set=source.{name}={_flow(value)}' for name, value in remedy['settings'].items())}"
-        f"{_note(remedy['condition'])}"
-        for remedy in given
-    ]
+    lines = [f"  {_settings(remedy['settings'])}{_note(remedy['condition'])}" for remedy in given]
     return ["what would supply it:", *dict.fromkeys(lines)] if lines else []
 
 
@@ -118,12 +114,17 @@ def _range_advice(found: Mapping[str, Any] | None, graph: Graph) -> list[str]:
     searched = max((getattr(node.actor, "disparities", 0) for node in graph.nodes), default=0)
     if found is None or found["doubt"] or not searched:
         return []
-    enough = f"--set=disparities={found['range_px']:.0f}"
+    enough = f"--set disparities={found['range_px']:.0f}"
     if searched >= AMPLE * found["range_px"]:
         return [f"  the ground and rocks of {ROCK} m need fewer than the {searched} disparities: {enough} is faster"]
     if found["ground_px"] < searched:
         return []
     return [f"  the near ground has more disparities than the {searched} searched at full size: {enough} includes it"]
+
+
+def _settings(values: Mapping[str, Any]) -> str:
+    """Settings of the source as options of a command."""
+    return " ".join(f"--set {shlex.quote(f'source.{name}={_flow(value)}')}" for name, value in values.items())
 
 
 def _flow(value: Any) -> str:

@@ -167,7 +167,8 @@ def why(
     graph = graph_of(result)
     rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
     if stream not in rules:
-        raise UsageError(f"the pipeline has no navigation map '{stream}', only {', '.join(rules) or 'none'}")
+        others = f"no navigation map '{stream}', only {', '.join(rules)}" if rules else "no navigation map"
+        raise UsageError(f"the pipeline has {others}")
     graph = graph.upstream_of([stream])
     with loading_kernels(), input_of(graph, result, log) as opened:
         items = instant(graph, opened, at)

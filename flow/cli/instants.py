@@ -23,9 +23,12 @@ Instant = float | np.datetime64 | np.timedelta64
 
 @dataclass(frozen=True)
 class Part:
-    """The frames of an instant. start, end: the part to read; at: the first frame of the instant; all in s after the
-    log's first message. frames, before: numbers of images from the instant on and before it; stamp: of its first
-    frame, ns; first: where the part begins without those before it; note: why the frame is not at the instant."""
+    """The frames of an instant, and those before it. Times are in s after the log's first message.
+
+    start, end: the part to read; first: where it would begin without the frames before the instant; at, stamp: the
+    first frame of the instant, in s and as its stamp, ns; frames, before: numbers of left images from the instant on
+    and before it; note: why that frame is not at the instant, else empty.
+    """
 
     start: float
     end: float
@@ -62,9 +65,9 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
 
 
 def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
-    """That a run over a part, whose summary is given, has no frame: with the losses at its stamp.
+    """The error for a part whose run gave no frame, with the loss at its stamp. summary: of that run.
 
-    Why a partner did not come is not said: the part ends before it could.
+    It does not say why a partner did not come: the part ends before it could.
     """
     lost = [entry for entry in summary["ledger"] if entry["stamp"] == part.stamp]
     details = ("" if entry["reason"] == LossReason.UNMATCHED else f" ({entry['detail']})" for entry in lost)
@@ -74,7 +77,7 @@ def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
 
 
 def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:
-    """That an instant is outside the images of a log, whose log times, ns, are given."""
+    """The sentence that an instant is outside the images of a log. times: their log times, ns."""
     if isinstance(at, float | int):
         first, last = ((int(time) - log.begin) / 1e9 for time in times[[0, -1]])
         return f"--at {at:g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s"

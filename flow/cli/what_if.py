@@ -59,11 +59,11 @@ def run_variants(
     logs: Sequence[Path], pipeline: str | Path, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
     folder: Path, workers: int,
 ) -> tuple[dict[str, Path], Variants, Part, list[str]]:  # fmt: skip
-    """Run all variants over a part of a log; returns their result logs in `folder`, the graphs, and the part that these
-    logs are of, and what a terminal prints of it.
+    """Run all variants over a part of a log. Returns their result logs in `folder`, the merged graphs, the part that
+    these logs cover, and notes for a terminal.
 
     pipeline: its name; or a result log of it, which then has the state before the instant; place: instant, frames from
-    there on, and frames before it, as for `part_of`. The logs have only the frames from the instant on.
+    there on, and frames before it, as for `part_of`. These logs have only the frames from the instant on.
 
     Raises
     ------

@@ -33,8 +33,8 @@ def format_description(description: dict[str, Any]) -> str:
         lines.append(_frame_line(d["frames"]))
         late = (d["frames"]["tilt_delay_s"] or 0) - (d["frames"]["delay_s"] or [0, 0])[1]
         if late > MAX_TILT_DELAY:
-            remedy = f"if no clock is wrong, --set=tilt.patience={late + 2:.0f}s makes a run wait for them"
-            lines.append(f"doubtful: tilts were logged {late:.1f} s later after their stamps than images; {remedy}")
+            remedy = f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them"
+            lines.append(f"doubtful: from stamp to log, tilts take {late:.1f} s longer than images; {remedy}")
     if d["mount"]:
         base, position = d["mount"]["base"], [round(value, 4) for value in d["mount"]["position"] or ()]
         lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")

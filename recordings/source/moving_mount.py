@@ -110,8 +110,8 @@ def moving_mount(
     static: TransformTree,
     joints: Mapping[str, Joint],
 ) -> MovingMount | None:
-    """The mount of a camera that no static transform joins to its inclinometer or to the rover's base, but moving ones;
-    None if there are none. It has the first samples."""
+    """The mount of a camera that moving transforms join to its inclinometer or to the rover's base, with the first
+    samples. None if static transforms join it to both, or if no transform that moves does."""
     if all(static.between(frame, camera.frame_id) is not None for frame in (inclinometer, base)):
         return None
     found, links = dict[str, list[Any]](), dict[str, set[Link]]()

@@ -17,7 +17,7 @@ from recordings.atomic_write import writing
 if TYPE_CHECKING:
     from recordings.export.georeference import Georeference
 
-HELP = "maps of a result log as GeoTIFF, PGM with YAML (map_server), PLY and PNG"
+HELP = "write the maps of a result log as GeoTIFF, PGM with YAML (map_server), PLY and PNG"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:

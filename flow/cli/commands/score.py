@@ -10,7 +10,7 @@ from flow.cli.outputs import check_outputs, write_text
 from flow.cli.report import say
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
 
-HELP = "errors of a result log, or of the logs of a fleet, against ground truth"
+HELP = "print the errors of a result log, or of the logs of a fleet, against ground truth"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:

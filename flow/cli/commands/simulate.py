@@ -19,14 +19,14 @@ HELP = "write a synthetic traverse with ground truth topics under /truth"
 DEGREE, PERCENT, MILLISECOND = math.radians(1), 0.01, 0.001
 
 # option -> (field of recordings.simulator.Simulation, its type, its unit, name of the value, help)
-OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
+OPTIONS: dict[str, tuple[str, type, float, str, str]] = {
     "scene": ("scene", str, 1, "NAME", "defaults for gravel, mixed, dunes, dusk or bedrock (mixed)"),
-    "frames": ("frames", int, 1, None, "number of stereo frames (12)"),
-    "seed": ("seed", int, 1, None, "random seed of terrain and noise (1)"),
+    "frames": ("frames", int, 1, "N", "number of stereo frames (12)"),
+    "seed": ("seed", int, 1, "N", "random seed of terrain and noise (1)"),
     "baseline": ("baseline", float, 1, "M", "distance between the cameras (0.24)"),
     "camera_height": ("camera_height", float, 1, "M", "height of the cameras above the ground (0.9)"),
     "pitch_down": ("pitch_down", float, DEGREE, "DEG", "angle of the cameras below the horizon (15)"),
-    "rocks": ("abundance", float, 1, "K", "share of ground under rocks, Golombek (0.1; dunes: 0.015; bedrock: 0.05)"),
+    "rocks": ("abundance", float, 1, "K", "ground under rocks, Golombek's k (0.1; dunes: 0.015; bedrock: 0.05)"),
     "slope": ("slope", float, DEGREE, "DEG", "RMS slope of the terrain (4)"),
     "sand": ("sand", float, PERCENT, "PERCENT", "ground that is sand (mixed: 45)"),
     "dust": ("dust", float, PERCENT, "PERCENT", "ground that is dust (mixed: 10)"),
@@ -43,9 +43,9 @@ OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
     "vignetting": ("vignetting", float, PERCENT, "PERCENT", "light that the corners lose (14)"),
     "exposure_difference": (
         "exposure_difference", float, PERCENT, "PERCENT",
-        "light that the right image gets more, besides 0.5 to 1 %% by the seed (0)",
+        "extra light in the right image, on top of the 0.5 to 1 %% that the seed adds (0)",
     ),
-    "row_offset": ("row_offset", float, 1, "PX", "rows that the right image is too low (0)"),
+    "row_offset": ("row_offset", float, 1, "PX", "rows by which the right image is too low (0)"),
     "exposure_time": ("exposure_time", float, MILLISECOND, "MS", "time of an exposure, for motion blur (0)"),
     "jpeg": ("jpeg", int, 1, "QUALITY", "write JPEG images of this quality, 1 to 100 (not compressed)"),
     "tilt_noise": ("tilt_noise", float, DEGREE, "DEG", "inclinometer noise, one sigma (0.1)"),
@@ -58,14 +58,14 @@ OPTIONS: dict[str, tuple[str, type, float, str | None, str]] = {
     ),
     "odometry_turn": (
         "odometry_turn", float, DEGREE, "DEG",
-        "heading drift of odometry after 1 m, one sigma; grows with its root (0.2)",
+        "heading drift of odometry after 1 m, one sigma; it grows with the root of the distance (0.2)",
     ),
 }  # fmt: skip
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
-    sub.add_argument("out", type=Path, metavar="OUT.mcap")
+    sub.add_argument("out", type=Path, metavar="OUT.mcap", help="the log to write")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
     for option, (_, kind, _, metavar, text) in OPTIONS.items():
         sub.add_argument(f"--{option.replace('_', '-')}", type=kind, metavar=metavar, help=text)

@@ -130,7 +130,7 @@ def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
     for lateness, doubted in ((0, False), (2, True)):
         earlier = changed(TILT, {"header.stamp.sec": lambda seconds, by=lateness: seconds - by})
         text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", earlier)))
-        doubt = "doubtful: tilts were logged 2.0 s later after their stamps than images; if no clock is wrong"
+        doubt = "doubtful: from stamp to log, tilts take 2.0 s longer than images; if no clock is wrong"
         assert (doubt in text) == doubted
 
 
