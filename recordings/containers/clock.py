@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from recordings.containers.timeline import Places, Timeline
 
-MAX_JITTER_NS = 100_000_000  # by so much, messages of a channel may be logged out of order
+MAX_JITTER_NS = 100_000_000  # messages of a channel may be logged out of order by this much
 SETTLING_NS = 1_000_000_000  # after the clock was set back, messages are lost until it is this far beyond its old time
 _MAX_STEPS = 8  # a clock is set rarely; more steps mean that the file is stored in another order
 _BEFORE = 3  # messages of a channel before a step whose header stamps are read; of those after it, the first
 _MAX_STAMPED = 3  # channels whose header stamps are read
 _DENSE = 1.5  # times the rate of a channel: two passes of the clock, not one
-_IRREGULAR = 0.1  # by so much the intervals of two passes spread more than those of each
+_IRREGULAR = 0.1  # the intervals of two passes together spread more than those of each by at least this
 
 StampAt = Callable[[int], int]  # place -> header stamp, ns; 0 if there is none
 

@@ -200,7 +200,7 @@ def _region(result: Path, lost: Counter[str] | None) -> tuple[Mosaic, dict[tuple
     (region,) = regions.values()
     terrain = region.elevation
     if terrain is None or "variance" not in terrain.fills:
-        raise LogError(f"the regional map of {result} has no variance; run a pipeline with stages.Fuse, such as rover")
+        raise LogError(f"the regional map of {result} has no variance; run a pipeline with FuseRegion, such as rover")
     tiles = dict[tuple[int, int], Array]()
     for index, layers in terrain.tiles():
         tile = tiles[index] = np.zeros(layers["elevation"].shape, _CELL)
