@@ -109,6 +109,10 @@ def run(
 
     Parameters
     ----------
+    graph
+        What `flow.config.loader.load` returns.
+    log
+        An opened log of the graph's source.
     outputs
         Sink class, as the pipeline names it -> the path it writes to. Sinks without a path are not used.
     workers
