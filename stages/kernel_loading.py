@@ -11,6 +11,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from llvmlite.binding import ffi
 from numba.core.dispatcher import Dispatcher
 
 SLOW_MODULES = ("numpy.ma",)  # that numpy imports when a stage first takes a median
@@ -25,8 +26,9 @@ def loading_kernels(*modules: str) -> Iterator[None]:
     ended = threading.Event()
 
     def work() -> None:
-        with suppress(Exception):  # numba imports it then as it does by default
-            import_arrays()
+        for prepare in (import_arrays, time_no_locks):
+            with suppress(Exception):  # numba then works as it does by default
+                prepare()
         for kernel in imported_kernels():
             if ended.is_set():
                 return
@@ -61,6 +63,13 @@ def import_arrays() -> None:
         import_module("numba.np.arraymath")
     finally:
         linalg.ensure_blas = found
+
+
+def time_no_locks() -> None:
+    """Let numba not time each lock of LLVM, which is a fifth of the time of loading."""
+    timed = ffi.lib._lock._cblist
+    for callbacks in tuple(timed):
+        ffi.unregister_lock_callback(*callbacks)
 
 
 def imported_kernels() -> list[Any]:
