@@ -41,6 +41,15 @@ def test_python_m_flow_runs_the_program():
     assert (done.returncode, done.stdout[:10]) == (0, "roverflow ")
 
 
+def test_idle_threads_of_blas_do_not_spin_while_the_program_starts():
+    code = "from flow.cli.__main__ import program; program(); import numpy, threadpoolctl; "
+    code += "print([pool['num_threads'] for pool in threadpoolctl.threadpool_info()])"
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    command = [sys.executable, "-c", code, "pipeline", "rover"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.stdout.endswith("\n[1]\n")
+
+
 @pytest.mark.slow
 def test_an_overwritten_package_of_the_wheel_is_named(tmp_path):
     venv.create(tmp_path / "venv", with_pip=True)

@@ -14,6 +14,7 @@ def program() -> int:
     import signal
 
     gc.set_threshold(20_000, 50, 50)  # imports make many objects and no garbage
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # frames fill the cores; idle threads of BLAS spin at the start
     try:
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is signal.SIG_DFL:
