@@ -76,7 +76,7 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self._file = opened(self.path)
-        self._last_table = LastTable()
+        self._last_table, self._recent = LastTable(), OpenChunks(self._unpacked, share=1 / 16)
         try:
             self.size = self.path.stat().st_size
             self.index = index_from_summary(self._file, self.size) or walk(self._file, self.size)
@@ -105,7 +105,7 @@ class McapFile:
         """
         low, high = (0 if start is None else start), (1 << 64 if end is None else end)
         queue = self._queue(channels, places)
-        found, opened = dict.fromkeys(channels, 0), OpenChunks(self._unpacked)
+        found, opened = dict.fromkeys(channels, 0), OpenChunks(self._recent.records)
         while queue and queue[0].log_time < high:
             first = heappop(queue)
             log_time, item, following = first.log_time, first.item, first.following
@@ -265,7 +265,7 @@ class McapFile:
 
     def _chunk_or_lost(self, chunk: ChunkIndex, opened: OpenChunks | None = None) -> ChunkMessages | list[LostMessage]:
         """The messages of a chunk, or a `LostMessage` for each entry of its message index."""
-        opened = opened or OpenChunks(self._unpacked)
+        opened = opened or OpenChunks(self._recent.records)
         try:
             return ChunkMessages(chunk, opened, self._last_table.of(chunk, opened))
         except PARSE_ERRORS as error:

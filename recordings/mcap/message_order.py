@@ -20,10 +20,10 @@ MAX_OPEN_BYTES = 1 << 28  # of unpacked chunks that overlap in time; those used 
 
 
 class OpenChunks:
-    """The unpacked chunks of one reader, at most `MAX_OPEN_BYTES` or a single one."""
+    """The unpacked chunks of one reader, at most a share of `MAX_OPEN_BYTES` or a single one."""
 
-    def __init__(self, unpack: Callable[[ChunkIndex], bytes | memoryview]) -> None:
-        self._unpack = unpack
+    def __init__(self, unpack: Callable[[ChunkIndex], bytes | memoryview], share: float = 1.0) -> None:
+        self._unpack, self._max_bytes = unpack, share * MAX_OPEN_BYTES
         self._open: dict[int, bytes | memoryview] = {}  # by offset in the file, the one used last at the end
 
     def records(self, chunk: ChunkIndex) -> bytes | memoryview:
@@ -43,7 +43,7 @@ class OpenChunks:
 
     def _make_room(self, size: int) -> None:
         total = size + sum(map(len, self._open.values()))
-        while self._open and total > MAX_OPEN_BYTES:
+        while self._open and total > self._max_bytes:
             total -= len(self._open.pop(next(iter(self._open))))
 
 

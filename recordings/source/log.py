@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import partial
 from heapq import merge
-from itertools import islice
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -299,8 +299,8 @@ class McapLog:
         part = self._range()
         if "left" not in self.topics or not part.edges:
             return
-        wide = part.widened(MAX_LATENESS_NS)
-        raws = self.file.messages(self.channels("left"), wide.low, wide.high)
+        ranges = part, part.widened(MAX_LATENESS_NS)  # in the first one is an image, unless stamps and log times differ
+        raws = chain.from_iterable(self.file.messages(self.channels("left"), each.low, each.high) for each in ranges)
         if not any(isinstance(raw, LostMessage) or part.has(self.stamp_of(raw), raw.log_time) for raw in raws):
             length = (self.file.end - self.file.start) / 1e9
             until = "its end" if self.end is None else f"{self.end:g} s"

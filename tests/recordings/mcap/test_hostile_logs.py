@@ -294,6 +294,17 @@ def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tm
     assert counts[1] > counts[0]
 
 
+def test_a_chunk_that_was_just_read_is_not_unpacked_again(sample, monkeypatch):
+    times = []
+    unpack = McapFile._unpacked
+    monkeypatch.setattr(McapFile, "_unpacked", lambda self, one: times.append(one) or unpack(self, one))
+    with McapFile(sample) as file:
+        assert [[*file.messages({number})] for number in file.channels] == [
+            [*file.messages({number})] for number in file.channels
+        ]
+        assert len(times) == len(file.index.chunks)
+
+
 @pytest.mark.parametrize("use_chunking", [True, False])
 def test_a_message_that_no_recorder_writes_is_lost_alone(tmp_path, whole, use_chunking):
     layout = {"use_chunking": use_chunking, "compression": CompressionType.NONE}
