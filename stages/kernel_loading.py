@@ -26,7 +26,7 @@ def loading_kernels(*modules: str) -> Iterator[None]:
     ended = threading.Event()
 
     def work() -> None:
-        for prepare in (import_arrays, time_no_locks):
+        for prepare in (import_arrays, stop_timing_locks):
             with suppress(Exception):  # numba then works as it does by default
                 prepare()
         for kernel in imported_kernels():
@@ -65,8 +65,8 @@ def import_arrays() -> None:
         linalg.ensure_blas = found
 
 
-def time_no_locks() -> None:
-    """Let numba not time each lock of LLVM, which is a fifth of the time of loading."""
+def stop_timing_locks() -> None:
+    """Stop numba from timing each lock of LLVM, which takes a fifth of the time of loading."""
     timed = ffi.lib._lock._cblist
     for callbacks in tuple(timed):
         ffi.unregister_lock_callback(*callbacks)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flow.parameters import check_parameters, parameter
+from flow.parameters import Checked, parameter
 from recordings.sinks import DESKS
 
 MIN_WIDTH = 8  # px, of a picture
 
 
 @dataclass(eq=False)
-class RecordingSettings:
+class RecordingSettings(Checked):
     """What a recording draws, how large, and how the viewer shows it."""
 
     application_id: str = parameter("roverflow", "recordings of one application share the layout that the viewer saves")
@@ -39,7 +39,7 @@ class RecordingSettings:
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     def __post_init__(self) -> None:
-        check_parameters(self)
+        super().__post_init__()
         if 0 < self.max_width < MIN_WIDTH:
             raise ValueError(
                 f"{type(self).__name__}.max_width must be 0 or at least {MIN_WIDTH} px, not {self.max_width} px"

@@ -103,7 +103,7 @@ class Match(Stage):
     unseen_cost: int = parameter(
         0, "cost of a partner outside the right image; 0: suits the cost. A match without a good prior needs more, or "
         "it prefers such partners to those of near ground",
-        low=0, high=100,
+        low=0, high=59,
     )  # fmt: skip
     uniqueness: int = parameter(0, "margin by which the best sum of paths must beat the next", low=0, high=254)
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
@@ -154,6 +154,10 @@ class Match(Stage):
         max_cost, (p1, p2) = COSTS[self.cost].max_cost, self._penalties()
         if not p2 > p1:
             raise ValueError(f"Match.p2 must be above Match.p1 = {p1}, not {p2}")
+        if self.unseen_cost > max_cost:
+            raise ValueError(
+                f"Match.unseen_cost must be at most {max_cost} with cost {self.cost}, not {self.unseen_cost}"
+            )
         if max_cost + p2 > MAX_BYTE:
             raise ValueError(f"Match.p2 must be at most {MAX_BYTE - max_cost} with cost {self.cost}, not {p2}")
 

@@ -14,9 +14,9 @@ ROOT = Path(__file__).parents[3]
 JITS = {"kernel", "part", "fast_kernel", "fast_part", "typed_kernel", "borrowing_kernel", "njit"}
 SCRIPT = """
 import numpy as np
-from stages.kernel_loading import imported_kernels, load, time_no_locks
+from stages.kernel_loading import imported_kernels, load, stop_timing_locks
 from stages.matching.kernels.census import _census, census
-time_no_locks()  # neither compiling nor loading needs it
+stop_timing_locks()  # neither compiling nor loading needs it
 print(_census in imported_kernels(), load(_census), len(_census.signatures))
 planes = np.zeros((3, 3, 64), np.uint8)
 census(np.arange(120, dtype=np.uint8).reshape(3, 40) // 2, planes)

@@ -98,6 +98,13 @@ def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(slope, ma
     assert np.isfinite(pixels[margin])[hidden].mean() < 0.05
 
 
+def test_partners_outside_the_right_image_win_where_they_cost_little(slope):
+    frame, truth = slope
+    visible = (np.arange(320) >= truth + 3) & (np.arange(320) < 48)
+    cheap, dear = (Match(disparities=48, unseen_cost=cost)(frame).pixels[visible] for cost in (2, 59))
+    assert np.isfinite(cheap).mean() < 0.5 < 0.9 < np.isfinite(dear).mean()
+
+
 def test_a_range_that_starts_elsewhere_finds_the_same(slope):
     frame, truth = slope
     inside = (truth > 14) & (truth < 30) & (np.arange(320) > 60)
@@ -305,6 +312,7 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
     [
         ({"p1": 100, "p2": 30}, "p2 must be above"),
         ({"p2": 220}, "at most 196 with cost census\\+gradient"),
+        ({"unseen_cost": 25, "cost": "census"}, "unseen_cost must be at most 24 with cost census"),
         ({"paths": 5}, "must be one of 4, 8"),
         ({"cost": "sad"}, "must be one of census, census\\+gradient"),
         ({"max_depth": "12m"}, "max_depth must be a number in m, not '12m'"),
