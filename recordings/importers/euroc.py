@@ -49,7 +49,10 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
         calibration = [folder / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
         if not calibration[0].exists():
             raise LogError(f"there is no {calibration[0]}; give --calibration, such as Kalibr's camchain.yaml")
-    notes = [note for path in calibration if (note := _header_note(path))]
+    notes = [
+        f"{path.name} of {path.parent.name} begins with %YAML:1.0, which is no YAML; the line is ignored"
+        for path in calibration if path.is_file() and path.read_bytes().startswith(b"%YAML:")
+    ]  # fmt: skip
     (left, right), calibrated = ordered(("cam0", "cam1"), read_calibration(calibration), notes)
     if calibrated.camera_from_imu is None or calibrated.right_in_left is None:
         raise LogError(f"{calibration[0]} lacks the transform between Imu and camera; give the file of imu and cameras")
@@ -62,16 +65,6 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
         [*filter(None, [rig.mount]), *mounts], [_imu(folder / "imu0" / "data.csv")],
         None if truth is None else _track(truth), true_tilt=True, notes=notes,
     )  # fmt: skip
-
-
-def _header_note(path: Path) -> str:
-    """A note about OpenCV's first line, which is not YAML."""
-    begins = path.is_file() and path.read_bytes().startswith(b"%YAML:")
-    return (
-        f"{path.name} of {path.parent.name} begins with %YAML:1.0, which is no YAML; the line is ignored"
-        if begins
-        else ""
-    )
 
 
 def ordered(

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from flow.contracts import counted
-from flow.parameters import check_parameters, is_required, parameter
+from flow.parameters import Checked, is_required, parameter
 from recordings.calibration.formats import read_calibration
 from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
@@ -49,7 +49,7 @@ _ANY: dict[str, Any] = {"low": -1e9, "high": 1e9}
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImageCalibration:
+class ImageCalibration(Checked):
     """The calibration file of `import_images`."""
 
     fx: float = parameter(MISSING, "focal length", unit="px", **_POSITIVE)
@@ -60,9 +60,6 @@ class ImageCalibration:
     cx_right: float | None = parameter(None, "principal point of the right image, by default cx", unit="px", **_ANY)
     width: float | None = parameter(None, "width of the images", unit="px", **_POSITIVE)
     height: float | None = parameter(None, "height of the images", unit="px", **_POSITIVE)
-
-    def __post_init__(self) -> None:
-        check_parameters(self)
 
 
 def import_images(
@@ -130,7 +127,8 @@ def import_images(
     period = round(1e9 / rate)
     rig = Rig(height=height, pitch_down=math.radians(pitch_down), roll=math.radians(roll))
     files = [calibration] if isinstance(calibration, Path) else calibration
-    if isinstance(files, Mapping) or (len(files) == 1 and _is_of_rectified(files[0])):
+    own = {known.name for known in fields(ImageCalibration)}
+    if isinstance(files, Mapping) or (len(files) == 1 and read_yaml(files[0]).keys() & own):
         values = _calibration(files if isinstance(files, Mapping) else files[0])
         camera = read_frame(0, (left[0], right[0]), values).camera
         rectified, cameras, beside_it = True, rectified_models(camera), beside(camera)
@@ -165,12 +163,6 @@ def standing(
     return ImportedRecording(cameras, True, pairs, [right, level], [*sensors, turns])
 
 
-def _is_of_rectified(path: Path) -> bool:
-    """Whether a calibration file has entries of `ImageCalibration`, or none at all."""
-    content = read_yaml(path)
-    return not isinstance(content, Mapping) or any(known.name in content for known in fields(ImageCalibration))
-
-
 def _raw(files: Sequence[Path], pair: tuple[Path, Path]) -> tuple[tuple[CameraModel, CameraModel], Transform]:
     """The cameras of images before rectification, and left <- right camera. Raises LogError, also for another pair."""
     calibrated = read_calibration(files)
@@ -184,13 +176,9 @@ def _raw(files: Sequence[Path], pair: tuple[Path, Path]) -> tuple[tuple[CameraMo
 
 def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
     """All values of the calibration. Raises LogError."""
-    where, loaded = "the calibration", given
-    if not isinstance(given, Mapping):
-        where, loaded = str(given), read_yaml(Path(given))
+    where, loaded = ("the calibration", given) if isinstance(given, Mapping) else (str(given), read_yaml(given))
     required = [known.name for known in fields(ImageCalibration) if is_required(known)]
     optional = [known.name for known in fields(ImageCalibration) if not is_required(known)]
-    if not isinstance(loaded, Mapping):
-        raise LogError(f"{where} must map names to numbers: {', '.join(required)}")
     if missing := [name for name in required if name not in loaded]:
         lists = f"{', '.join(required)} and may have {', '.join(optional)}"
         raise LogError(f"{where} lacks '{missing[0]}'; it needs {lists}")

@@ -60,7 +60,8 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     )  # fmt: skip
     if poses is None:
         notes.append("there are no poses, and no tilt in the files: the car is taken as level in every frame")
-        track, tilts = None, map(level_tilt, stamps)
+        level = np.array([0.0, 0.0, 0.0, 1.0])
+        track, tilts = None, ((stamp, "/inclinometer", imu(stamp, BASE, level)) for stamp in stamps)
     else:
         notes.append(f"the tilt is that of the first frame by the rig file, turned by the true poses in {poses.name}")
         track = _track(poses, stamps, mount, shift)
@@ -68,11 +69,6 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     return ImportedRecording(
         rectified_models(camera), True, pairs, [mount, beside(camera)], [tilts], track, notes=notes
     )  # fmt: skip
-
-
-def level_tilt(stamp: int) -> Logged:
-    """The tilt of a rover that stands level."""
-    return stamp, "/inclinometer", imu(stamp, BASE, np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 def stereo_camera(projections: list[Array], size: tuple[int, int]) -> tuple[StereoCamera, Array]:

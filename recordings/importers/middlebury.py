@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.importers.files import read_bytes
+from recordings.importers.files import read_bytes, read_lines
 from recordings.importers.images import read_frame, standing
 from recordings.importers.recording import (
     FIRST_STAMP,
@@ -29,9 +29,9 @@ from recordings.importers.recording import (
     write_recording,
 )
 from recordings.importers.rig import Rig
-from recordings.ros2.to_msg import disparity_image, image
+from recordings.ros2.to_msg import disparity_image, exact_disparity, image
 from recordings.scoring.stereo_metrics import SEEN_BY_BOTH, SEEN_BY_NONE, SEEN_BY_ONE, cropped_columns
-from stages.data import Array, Disparity, PixelOrigin, StereoFrame
+from stages.data import Array, StereoFrame
 
 IMAGES, CALIBRATION, MASK = ("im0.png", "im1.png"), "calib.txt", "mask0nocc.png"
 TRUTHS = ("disp0GT.pfm", "disp0.pfm")  # the first one found is used
@@ -147,11 +147,8 @@ def _is_scene(folder: Path) -> bool:
 
 def _calibration(path: Path) -> tuple[dict[str, str], dict[str, float]]:
     """The entries of calib.txt as text, and as fx, fy, cx, cy, cx_right, width, height, ndisp (px), baseline (m)."""
-    try:
-        lines = read_bytes(path).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise LogError(f"{path} is not a text file; get it again") from error
-    text = {key.strip(): value.strip() for key, found, value in (line.partition("=") for line in lines) if found}
+    entries = (line.partition("=") for _, line in read_lines(path))
+    text = {key.strip(): value.strip() for key, found, value in entries if found}
     for name in ("cam0", *_NUMBERS):
         if name not in text:
             raise LogError(f"{path} lacks '{name}'; it needs {', '.join(('cam0', *_NUMBERS))}")
@@ -199,10 +196,7 @@ def _same_size(truth: Array, frame: StereoFrame, path: Path) -> Array:
 def _truth(scene: MiddleburyScene) -> Iterator[Logged]:
     stamp, truth = scene.frame.stamp, scene.truth
     if truth is not None:
-        known = np.isfinite(truth)
-        source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
-        disparity = Disparity(stamp, truth, source, known.astype(np.float32), camera=scene.frame.camera)
-        message = replace(disparity_image(disparity), min_disparity=0.0, max_disparity=float(scene.ndisp))
-        yield stamp, "/truth/disparity", message
+        message = disparity_image(exact_disparity(stamp, truth, scene.frame.camera))
+        yield stamp, "/truth/disparity", replace(message, min_disparity=0.0, max_disparity=float(scene.ndisp))
     if scene.occlusion is not None:
         yield stamp, "/truth/occlusion", image(stamp, LEFT, scene.occlusion)

@@ -145,8 +145,7 @@ def _frames(
         for side, frame, model in zip(SIDES, (LEFT, RIGHT), recording.cameras, strict=True):
             yield stamp, f"/stereo/{side}/camera_info", ros2.camera_info(stamp, frame, model)
         yield from images
-        if recording.truth is not None:
-            yield from _true_pose(recording, stamp, camera, tree)
+        yield from _true_pose(recording, stamp, camera, tree)
         yield from recording.more(number)
         progress(number + 1)
 
@@ -191,8 +190,7 @@ def _mark(pairs: Sequence[ImagePair]) -> str:
 
 def _true_pose(recording: ImportedRecording, stamp: int, camera: Camera, tree: TransformTree) -> Iterator[Logged]:
     """The true pose of base_link, or of the left camera's rectified image without it, and the true tilt."""
-    track = recording.truth
-    placed = None if track is None else track.at(stamp)
+    placed = None if recording.truth is None else recording.truth.at(stamp)
     to_camera = None if placed is None else tree.between(placed.child, LEFT)
     if placed is None or to_camera is None:
         return
@@ -238,14 +236,12 @@ def rectified_models(camera: StereoCamera) -> tuple[CameraModel, CameraModel]:
 
 def raw_models(calibration: StereoCalibration, size: tuple[int, int]) -> tuple[CameraModel, CameraModel]:
     """The calibration of a pair before rectification, with K as the projection and `size`, px, where it has none."""
-    left, right = calibration.models
-    return _completed(left, size), _completed(right, size)
-
-
-def _completed(model: CameraModel, size: tuple[int, int]) -> CameraModel:
-    p = model.p if np.any(model.p) else np.column_stack([model.k, np.zeros(3)])
-    width, height = (model.width, model.height) if model.width and model.height else size
-    return replace(model, p=p, width=width, height=height)
+    models = []
+    for model in calibration.models:
+        p = model.p if np.any(model.p) else np.column_stack([model.k, np.zeros(3)])
+        width, height = (model.width, model.height) if model.width and model.height else size
+        models.append(replace(model, p=p, width=width, height=height))
+    return models[0], models[1]
 
 
 def beside(camera: StereoCamera) -> Transform:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -116,12 +116,12 @@ def read_rig(path: Path | None, entries: Collection[str]) -> Rig:
         return Rig()
     content, hints = read_yaml(path, "rig file"), get_type_hints(Rig)
     known = {entry.name: entry for entry in fields(Rig) if entry.name in entries}
-    values: Mapping[str, Any] = {}
+    values: dict[str, Any] = {}
     for name, value in content.items():
         if name not in known:
             raise LogError(f"{path} has the entry '{name}', which is not used; it may have {', '.join(known)}")
         try:
-            values = {**values, name: coerced(value, hints[name], known[name])}
+            values[name] = coerced(value, hints[name], known[name])
         except (ValueError, OverflowError) as error:
             raise LogError(f"{path}: '{name}': {error}") from error
     rig = Rig(**values)

@@ -31,9 +31,9 @@ from recordings.importers.recording import (
 )
 from recordings.importers.rig import Rig
 from recordings.importers.track import Track
-from recordings.ros2.to_msg import disparity_image
+from recordings.ros2.to_msg import disparity_image, exact_disparity
 from recordings.source.transforms import BODY_FROM_OPTICAL
-from stages.data import Array, Disparity, PixelOrigin, StereoCamera
+from stages.data import Array, StereoCamera
 
 # Names of the left and right camera, the second of TartanAir's first version.
 CAMERAS = (("lcam_front", "rcam_front"), ("left", "right"))
@@ -97,9 +97,7 @@ def _truth(stamp: int, camera: StereoCamera, path: Path | None) -> Iterator[Logg
     known = np.isfinite(depth) & (depth > 0) & (depth < MAX_DEPTH)
     pixels = np.full(depth.shape, np.nan, np.float32)
     pixels[known] = camera.fx * camera.baseline / depth[known].astype(np.float64)
-    source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
-    disparity = Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
-    yield stamp, "/truth/disparity", disparity_image(disparity)
+    yield stamp, "/truth/disparity", disparity_image(exact_disparity(stamp, pixels, camera))
 
 
 def _depth(path: Path) -> Array:

@@ -19,8 +19,10 @@ from stages.data import (
     Disparity,
     ElevationMap,
     NavigationMap,
+    PixelOrigin,
     PointCloud,
     Pose,
+    StereoCamera,
     Transform,
 )
 from stages.data.rotations import canonical, quaternion_of
@@ -99,6 +101,13 @@ def disparity_image(disparity: Disparity, step: float = 0.0) -> Any:
         valid_window=_region(width, height),
         min_disparity=float(low), max_disparity=float(high), delta_d=step,
     )  # fmt: skip
+
+
+def exact_disparity(stamp: int, pixels: Array, camera: StereoCamera) -> Disparity:
+    """True disparities, (H, W) float32 px, NaN = unknown, for `disparity_image`."""
+    known = np.isfinite(pixels)
+    source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
+    return Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
 
 
 def source_image(disparity: Disparity) -> Any:

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from recordings.ros2.to_msg import exact_disparity
 from recordings.simulator import raycast
 from recordings.simulator.simulation import FrameTruth, Simulation
 from stages.compiled.jit import typed_kernel
-from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap, PixelOrigin
+from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap
 
 CELL_POINTS = 3  # along each side of a cell
 SIGHT_TOLERANCE = 0.002  # m before its end that a line of sight may stop
@@ -26,10 +27,8 @@ MAX_ROCK_DISTANCE = 10.0  # m from base_link
 def true_disparity(simulation: Simulation, stamp: int, truth: FrameTruth) -> Disparity:
     """fx * baseline / depth, px; NaN in the sky."""
     camera = simulation.camera
-    pixels = np.where(np.isfinite(truth.depth), camera.fx * camera.baseline / truth.depth, np.nan).astype(np.float32)
-    known = np.isfinite(pixels)
-    source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
-    return Disparity(stamp, pixels, source, known.astype(np.float32), camera=camera)
+    pixels = np.where(np.isfinite(truth.depth), camera.fx * camera.baseline / truth.depth, np.nan)
+    return exact_disparity(stamp, pixels.astype(np.float32), camera)
 
 
 def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[ElevationMap, NavigationMap]:

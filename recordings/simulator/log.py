@@ -8,16 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.simulation import FrameTruth, Simulation
 from recordings.source.calibration import pinhole
-from stages.data import LEVEL_FRAME, Transform
+from stages.data import LEVEL_FRAME
 
-Logged = tuple[int, str, Any]
+Messages = dict[str, Any]  # by topic
 
 ROCK_FIELDS = ("x", "y", "z", "diameter", "height", "pixels", "shown")
 
@@ -32,16 +31,16 @@ def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], 
     >>> write_log(Simulation(frames=4), Path("traverse.mcap"))  # doctest: +SKIP
     """
     with Ros2Writer(Path(out)) as writer:
-        for _, make_messages, index in sorted(_moments(simulation), key=lambda moment: moment[0]):
-            for log_time, topic, message in make_messages():
+        for log_time, make_messages, index in sorted(_moments(simulation), key=lambda moment: moment[0]):
+            for topic, message in make_messages().items():
                 writer.write(topic, message, log_time)
             if index is not None and progress is not None:
                 progress(index + 1, simulation.frames)
 
 
-def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Logged]], int | None]]:
+def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], Messages], int | None]]:
     """(log time, function that makes the messages, frame index or None), unordered."""
-    yield simulation.begin, partial(static_transforms, simulation, simulation.begin), None
+    yield simulation.begin, partial(static_transforms, simulation), None
     raw = simulation.imu == "raw"
     tilt = (imu, simulation.imu_rate, 4_000_000) if raw else (inclinometer, simulation.tilt_rate, 4_000_000)
     sensors = [tilt, (odometry, simulation.odometry_rate, 9_000_000)]
@@ -49,60 +48,56 @@ def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], list[Lo
         sensors.append((mast, simulation.mast_rate, 6_000_000))
     for make_messages, rate, latency in sensors:
         for number, stamp in enumerate(simulation.sensor_stamps(rate)):
-            yield stamp + latency, partial(make_messages, simulation, number, stamp, stamp + latency), None
+            yield stamp + latency, partial(make_messages, simulation, number, stamp), None
     for index in range(simulation.frames):
-        at = simulation.stamp(index) + 21_000_000
-        yield at, partial(frame, simulation, index, at), index
+        yield simulation.stamp(index) + 21_000_000, partial(frame, simulation, index), index
 
 
-def static_transforms(simulation: Simulation, log_time: int) -> list[Logged]:
+def static_transforms(simulation: Simulation) -> Messages:
     """/tf_static: the mounts of cameras and inclinometer; those of the cameras are on the mast if it turns."""
     *cameras, sensor = simulation.mounts
     if simulation.pan:
         head = traverse.mast(simulation.camera_height, 0.0).inverse()
         cameras = [head.after(camera) for camera in cameras]
-    return [(log_time, "/tf_static", ros2.transform_message((mount, log_time) for mount in (*cameras, sensor)))]
+    return {"/tf_static": ros2.transform_message((mount, simulation.begin) for mount in (*cameras, sensor))}
 
 
-def mast(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
+def mast(simulation: Simulation, number: int, stamp: int) -> Messages:
     """/tf: the mast, which turns."""
     head = traverse.mast(simulation.camera_height, simulation.pan_at(stamp))
-    return [(log_time, "/tf", ros2.transform_message([(head, stamp)]))]
+    return {"/tf": ros2.transform_message([(head, stamp)])}
 
 
-def inclinometer(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
+def inclinometer(simulation: Simulation, number: int, stamp: int) -> Messages:
     """/imu/inclinometer: roll and pitch with noise; the heading is unknown, with the variance of a uniform angle."""
     rng = np.random.default_rng([simulation.seed, 4, number])
     reading = traverse.inclinometer_reading(
         simulation.base_at(stamp), simulation.mounts[2], simulation.tilt_noise, rng
     )  # fmt: skip
     variance = max(simulation.tilt_noise, 1e-6) ** 2
-    message = ros2.imu(stamp, traverse.INCLINOMETER_FRAME, reading, np.diag([variance, variance, np.pi**2 / 3]))
-    return [(log_time, "/imu/inclinometer", message)]
+    covariance = np.diag([variance, variance, np.pi**2 / 3])
+    return {"/imu/inclinometer": ros2.imu(stamp, traverse.INCLINOMETER_FRAME, reading, covariance)}
 
 
-def imu(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
+def imu(simulation: Simulation, number: int, stamp: int) -> Messages:
     """/imu/data_raw: accelerations and rates, without an orientation."""
     rate, acceleration = simulation.inertial.rates[number], simulation.inertial.accelerations[number]
-    return [(log_time, "/imu/data_raw", ros2.raw_imu(stamp, traverse.INCLINOMETER_FRAME, rate, acceleration))]
+    return {"/imu/data_raw": ros2.raw_imu(stamp, traverse.INCLINOMETER_FRAME, rate, acceleration)}
 
 
-def odometry(simulation: Simulation, number: int, stamp: int, log_time: int) -> list[Logged]:
+def odometry(simulation: Simulation, number: int, stamp: int) -> Messages:
     """/odometry and /tf: dead reckoning since the first message."""
     pose = simulation.odometry[number]
-    rotation = Rotation.from_quat(pose.quaternion).as_matrix()
-    moved = Transform(pose.frame_id, pose.child_frame_id, rotation, pose.position)
-    return [(log_time, "/odometry", ros2.odometry(pose)), (log_time, "/tf", ros2.transform_message([(moved, stamp)]))]
+    return {"/odometry": ros2.odometry(pose), "/tf": ros2.transform_message([(pose.transform, stamp)])}
 
 
-def frame(simulation: Simulation, index: int, log_time: int) -> list[Logged]:
+def frame(simulation: Simulation, index: int) -> Messages:
     """Images, calibration and truth of one frame."""
     stamp, truth = simulation.stamp(index), simulation.frame(index)
-    messages = {**_camera_messages(simulation, stamp, truth), **_truth_messages(simulation, stamp, truth)}
-    return [(log_time, topic, message) for topic, message in messages.items()]
+    return _camera_messages(simulation, stamp, truth) | _truth_messages(simulation, stamp, truth)
 
 
-def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> dict[str, Any]:
+def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> Messages:
     messages = {}
     name = "image_rect_color" if simulation.color else "image_rect"
     sides = (("left", traverse.LEFT_FRAME), ("right", traverse.RIGHT_FRAME))
@@ -118,7 +113,7 @@ def _camera_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> d
     return messages
 
 
-def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> dict[str, Any]:
+def _truth_messages(simulation: Simulation, stamp: int, truth: FrameTruth) -> Messages:
     elevation, hazards = ground_truth.truth_maps(simulation, stamp, truth)
     rocks = ground_truth.rocks_in_level(simulation, truth)
     level_from_camera = truth.level.rotation.T @ truth.base.after(truth.mounts[0]).rotation
