@@ -120,8 +120,7 @@ def _codes(one: Any, other: Any) -> Measures:
 
 
 def _poses(one: Any, other: Any) -> Measures:
-    first, second = one.pose.pose, other.pose.pose
-    return _moved((first.position, first.orientation), (second.position, second.orientation))
+    return _moved(*((each.pose.pose.position, each.pose.pose.orientation) for each in (one, other)))
 
 
 def _transforms(one: Any, other: Any) -> Measures:

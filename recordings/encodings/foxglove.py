@@ -6,7 +6,8 @@ The fields are those of foxglove-sdk's schemas. Bytes are base64 in JSON, and ti
 from __future__ import annotations
 
 from binascii import a2b_base64
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -85,12 +86,9 @@ def _image(message: Any) -> Any:
     )  # fmt: skip
 
 
-def _compressed_image(message: Any) -> Any:
-    return SimpleNamespace(header=_header(message), format=str(message.format), data=_bytes(message.data))
-
-
-def _video(message: Any) -> Any:
-    return SimpleNamespace(header=_header(message), video_format=str(message.format), data=_bytes(message.data))
+def _encoded(message: Any, format_name: str = "format") -> Any:
+    format_of = {format_name: str(message.format)}
+    return SimpleNamespace(header=_header(message), data=_bytes(message.data), **format_of)
 
 
 def _calibration(message: Any) -> Any:
@@ -104,8 +102,8 @@ def _calibration(message: Any) -> Any:
     )  # fmt: skip
 
 
-def _transforms(message: Any) -> Any:
-    return SimpleNamespace(transforms=[_transform(each) for each in message.transforms])
+def _transforms(messages: Iterable[Any]) -> Any:
+    return SimpleNamespace(transforms=[_transform(each) for each in messages])
 
 
 def _transform(message: Any) -> Any:
@@ -114,28 +112,20 @@ def _transform(message: Any) -> Any:
     return SimpleNamespace(header=header, child_frame_id=str(message.child_frame_id), transform=transform)
 
 
-def _pose(message: Any) -> Any:
-    return SimpleNamespace(header=_header(message), pose=_plain_pose(message.pose))
-
-
 def _odometry(message: Any) -> Any:
-    pose = SimpleNamespace(pose=_plain_pose(message.pose), covariance=_numbers(message, "pose_covariance", 36))
+    pose = SimpleNamespace(pose=message.pose, covariance=_numbers(message, "pose_covariance", 36))
     return SimpleNamespace(header=_header(message), child_frame_id=str(message.body_frame_id), pose=pose)
-
-
-def _plain_pose(pose: Any) -> Any:
-    return SimpleNamespace(position=pose.position, orientation=pose.orientation)
 
 
 _ADAPTERS: dict[str, tuple[str, Adapter]] = {
     "RawImage": ("sensor_msgs/msg/Image", _image),
-    "CompressedImage": ("sensor_msgs/msg/CompressedImage", _compressed_image),
-    "CompressedVideo": (VIDEO, _video),
+    "CompressedImage": ("sensor_msgs/msg/CompressedImage", _encoded),
+    "CompressedVideo": (VIDEO, partial(_encoded, format_name="video_format")),
     "CameraCalibration": ("sensor_msgs/msg/CameraInfo", _calibration),
-    "FrameTransforms": ("tf2_msgs/msg/TFMessage", _transforms),
-    "FrameTransform": (
-        "tf2_msgs/msg/TFMessage", lambda message: SimpleNamespace(transforms=[_transform(message)])
+    "FrameTransforms": ("tf2_msgs/msg/TFMessage", lambda message: _transforms(message.transforms)),
+    "FrameTransform": ("tf2_msgs/msg/TFMessage", lambda message: _transforms([message])),
+    "PoseInFrame": (
+        "geometry_msgs/msg/PoseStamped", lambda message: SimpleNamespace(header=_header(message), pose=message.pose)
     ),
-    "PoseInFrame": ("geometry_msgs/msg/PoseStamped", _pose),
     "Odometry": ("nav_msgs/msg/Odometry", _odometry),
 }  # fmt: skip

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from recordings.export.mosaic import Mosaic
-from stages.data import Array, Cell
+from stages.data import Cell
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
@@ -23,7 +23,8 @@ def write_pgm(path: Path, mosaic: Mosaic, layer: str) -> None:
     with path.open("wb") as file:
         file.write(f"P5\n{cols} {rows}\n255\n".encode())
         for strip in mosaic.strips(layer):
-            file.write(_grays(strip).tobytes())
+            grays = np.select([strip == Cell.FREE, strip == Cell.HAZARD], [FREE, OCCUPIED], UNKNOWN)
+            file.write(grays.astype(np.uint8).tobytes())
 
 
 def write_yaml(path: Path, picture: str, mosaic: Mosaic) -> None:
@@ -39,10 +40,3 @@ def write_yaml(path: Path, picture: str, mosaic: Mosaic) -> None:
         f"occupied_thresh: {OCCUPIED_THRESH}\n"
         f"free_thresh: {FREE_THRESH}\n"
     )
-
-
-def _grays(cells: Array) -> Array:
-    grays = np.full(cells.shape, UNKNOWN, np.uint8)
-    grays[cells == Cell.FREE] = FREE
-    grays[cells == Cell.HAZARD] = OCCUPIED
-    return grays

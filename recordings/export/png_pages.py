@@ -73,11 +73,8 @@ def navigation_page(navigation: NavigationMap) -> Array:
 
 def verdict_page(navigation: NavigationMap) -> Array:
     """The same of all of a navigation map."""
-    colors, unknown = (
-        colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND),
-        colormaps.CELL_LEGEND[Cell.UNKNOWN],
-    )
-    rgb, origin = with_rover(colors, navigation, unknown[1])
+    colors = colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND)
+    rgb, origin = with_rover(colors, navigation, colormaps.CELL_LEGEND[Cell.UNKNOWN][1])
     page = map_page(rgb, navigation.resolution, origin, f"navigation map ({navigation.frame_id})")
     add_legend(page, colormaps.CELL_LEGEND)
     return page

@@ -248,12 +248,6 @@ class _Tally:
             )
         return np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
 
-    def _disparity_metrics(self) -> dict[str, Any] | None:
-        if self.disparity is None:
-            return None
-        surfaces = {name: errors.metrics()["whole_image"]["nonocc"] for name, errors in self.surfaces.items()}
-        return self.disparity.metrics() | ({"by_surface": surfaces} if surfaces else {})
-
     def _add_terrain(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_grid_map(frame["/truth/elevation_map"])
         try:
@@ -316,7 +310,9 @@ class _Tally:
             raise LogError(f"no result in {self.result} has a stamp of {self.truth}; score a run of that log")
         found.missing = {topic: found.missing[topic] for topic in RESULTS if topic in found.missing}
         found.lost = {log: dict(why) for log, why in self.lost.items() if why}
-        found.disparity = self._disparity_metrics()
+        if self.disparity is not None:
+            surfaces = {name: errors.metrics()["whole_image"]["nonocc"] for name, errors in self.surfaces.items()}
+            found.disparity = self.disparity.metrics() | ({"by_surface": surfaces} if surfaces else {})
         if self.terrain and (self.fitting or not found.unscored.keys() & {*RESULTS[1:]}):
             found.terrain = self.terrain.metrics()
         if tilts := self.tilts:

@@ -193,16 +193,12 @@ def terrain_lines(found: dict[str, Any]) -> list[str]:
 
 
 def _motion_lines(found: Score) -> list[str]:
-    return [*_tilt_lines(found), *(pose_lines(found.pose) if found.pose is not None else [])]
-
-
-def _tilt_lines(found: Score) -> list[str]:
     lines = [f"tilt         not scored in {counted(count, 'frame')}: {why}" for why, count in found.untilted.items()]
     if (t := found.tilt) is not None:
         mean, worst = (math.degrees(t[name]) for name in ("mean", "max"))
         frames = counted(int(t["frames"]), "frame")
         lines = [f"tilt         mean error {mean:.3f} deg, largest {worst:.3f} deg, in {frames}", *lines]
-    return lines
+    return [*lines, *(pose_lines(found.pose) if found.pose is not None else [])]
 
 
 def pose_lines(found: dict[str, float]) -> list[str]:
