@@ -1,6 +1,5 @@
 """A small stereo log with asymmetric images, and the same messages in other MCAP layouts."""
 
-import os
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import fields, is_dataclass
 from operator import attrgetter
@@ -8,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 from zstandard import ZstdCompressor
@@ -18,7 +16,7 @@ from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import camera_info, image, imu, odometry, transform_message
-from stages.data import CameraModel, Pose, Transform
+from stages.data import CameraModel, Pose, StereoFrame, Transform
 from tests.conftest import Extra, rewrite
 
 WIDTH, HEIGHT = 24, 16
@@ -29,14 +27,6 @@ START = 1_700_000_000_000_000_000
 LEFT, RIGHT, TILT = "/stereo/left/image_rect", "/stereo/right/image_rect", "/imu/data"
 INFOS = "/stereo/left/camera_info", "/stereo/right/camera_info"
 UNSTAMPED = {"header.stamp.sec": 0, "header.stamp.nanosec": 0}  # for `changed`
-
-
-def data_folder(name: str) -> Path:
-    """A folder of the real data, or a skip with its name."""
-    folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / name
-    if "ROVERFLOW_DATA" not in os.environ or not folder.exists():
-        pytest.skip(f"needs the real data: set ROVERFLOW_DATA to the folder with {name}")
-    return folder
 
 
 def model(side: str = "left", **changes: Any) -> CameraModel:
@@ -149,6 +139,14 @@ def mounted(*transforms: Transform) -> Edit:
 def items_of(path: Path | Sequence[Path], source: McapSource | None = None, **bounds: float) -> list[Event]:
     with (source or McapSource()).open(path, **bounds) as log:
         return list(log.events())
+
+
+def frame_of(path: Path) -> StereoFrame:
+    """The last stereo frame of a log that lacks a pose alone."""
+    with McapSource().open(path) as log:
+        assert set(log.missing) == {"odometry"}
+        images = {stream: item for _, stream, item in log.events(("left", "right"))}
+    return images["left"].pair_with(images["right"])
 
 
 def with_extra(path: Path, extra: Extra, **options: Any) -> Path:

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from recordings import McapSource
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
+from tests.conftest import data_folder
 from tests.recordings.calibration.euroc_bag import euroc_bag, euroc_rosbag2, kalibr_camchain
-from tests.recordings.sample_log import HEIGHT, INFOS, LEFT, RIGHT, WIDTH, data_folder, dropped, items_of, write_sample
+from tests.recordings.sample_log import HEIGHT, INFOS, LEFT, RIGHT, WIDTH, dropped, items_of, write_sample
 
 INTRINSICS = [[458.6, 457.3, 367.2, 248.4], [457.6, 456.1, 379.9, 255.2]]
 K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in INTRINSICS]

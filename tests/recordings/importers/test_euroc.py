@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from recordings.mcap.file import iter_decoded
 from stages import Rectify, StereoFrame
 from stages.rectification.row_offset import measure, offset_field
-from tests.conftest import roverflow
+from tests.conftest import data_folder, roverflow
 from tests.recordings.calibration.euroc_bag import kalibr_camchain
 from tests.recordings.importers.simulated import (
     EXACT,
@@ -25,7 +25,6 @@ from tests.recordings.importers.simulated import (
     write_images,
     write_lines,
 )
-from tests.recordings.sample_log import data_folder
 
 SIMULATION = replace(gray(EXACT), imu="raw", imu_rate=50.0, rest=2.0)
 SENSOR = """%YAML:1.0

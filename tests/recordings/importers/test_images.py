@@ -15,9 +15,11 @@ from recordings.importers import files
 from recordings.importers.images import import_images
 from recordings.importers.pairing import pair_images
 from recordings.source.transforms import BODY_FROM_OPTICAL
-from tests.conftest import roverflow
+from stages.rectification.rectify import Rectify
+from stages.rectification.row_offset import measure
+from tests.conftest import data_folder, roverflow
 from tests.recordings.importers.simulated import EXACT, assert_same, own_log, seen_in, write_images
-from tests.recordings.sample_log import data_folder, picture
+from tests.recordings.sample_log import frame_of, picture
 
 CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
 
@@ -176,24 +178,41 @@ def test_the_calibration_may_be_a_file(tmp_path):
     file = tmp_path / "camera.yaml"
     file.write_text("fx: 20\nfy: 21.5\ncx: 11\ncy: 7\ncx_right: 13\nbaseline: 0.25\n")
     import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
-    images = {stream: item for _, stream, item in events(tmp_path / "out.mcap") if stream in ("left", "right")}
-    camera = images["left"].pair_with(images["right"]).camera
+    camera = frame_of(tmp_path / "out.mcap").camera
     assert (camera.fy, camera.cx, camera.cx_right) == (21.5, 11.0, 13.0)
     file.write_text("fx: [")
     with pytest.raises(LogError, match="cannot be read as YAML"):
         import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
 
 
-def test_pairs_that_are_not_rectified_have_the_calibration_of_its_files(tmp_path):
+def test_pairs_that_are_not_rectified_have_the_calibration_of_its_files_and_end_up_row_aligned(tmp_path):
     folder = data_folder("polar")
     files = [folder / "calib" / f"{name}.yml" for name in ("left_intrinsics", "right_intrinsics", "extrinsics")]
     given = "--calibration", *files, "--pitch-down", 35, "--height", 1.35
     assert roverflow("import", "images", folder, tmp_path / "polar.mcap", *given) == 0
-    images = {stream: item for _, stream, item in events(tmp_path / "polar.mcap") if stream in ("left", "right")}
-    camera = images["left"].pair_with(images["right"]).camera
+    frame = frame_of(tmp_path / "polar.mcap")
+    camera = frame.camera
     assert camera.baseline == pytest.approx(0.3996, abs=1e-4)
     assert camera.raw[0].k[0, 0] == pytest.approx(1452.71)
     assert camera.raw[1].d[:2] == pytest.approx([-0.017925, -0.019475])
+    assert abs(row_offset(frame)) > 2.0
+    assert 1.0 < abs(row_offset(Rectify(row_offset=0)(frame))) < 2.0  # its calibration leaves about 1.6 px
+    aligned = Rectify()(frame)
+    rest = measure([(aligned.left, aligned.right)])
+    assert not rest.clear
+    assert rest.largest < 0.5
+
+
+def row_offset(frame):
+    """Median of v_left - v_right over mutual feature matches, px."""
+    features = cv2.ORB.create(4000, nlevels=4)
+    (points1, codes1), (points2, codes2) = (
+        features.detectAndCompute(np.ascontiguousarray(image), None) for image in (frame.left, frame.right)
+    )
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(codes1, codes2)
+    moves = np.array([np.subtract(points1[p.queryIdx].pt, points2[p.trainIdx].pt) for p in pairs if p.distance < 40])
+    likely = moves[(np.abs(moves[:, 1]) < 30) & (moves[:, 0] > 0)]
+    return np.median(likely[:, 1])
 
 
 def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tmp_path):
@@ -202,8 +221,7 @@ def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tm
     lens |= {name: [[20.0, 0, 11.5], [0, 20.0, 7.5], [0, 0, 1.0]] for name in ("M1", "M2")}
     (file := tmp_path / "stereo.yaml").write_text(yaml.safe_dump(lens))
     import_images(left, right, file, tmp_path / "out.mcap", pitch_down=10, height=1)
-    images = {stream: item for _, stream, item in events(tmp_path / "out.mcap") if stream in ("left", "right")}
-    camera = images["left"].pair_with(images["right"]).camera
+    camera = frame_of(tmp_path / "out.mcap").camera
     assert camera.baseline == pytest.approx(0.25)
     assert [model.d[0] for model in camera.raw] == [0.01, 0.02]
     save(right[0], picture(0)[:8])
@@ -216,8 +234,7 @@ def test_a_colour_image_may_have_a_gray_partner(tmp_path):
     save(right[0], cv2.cvtColor(picture(1), cv2.COLOR_RGB2GRAY))
     assert picture(0).ndim == 3
     assert import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1) == (1, [])
-    images = {stream: item for _, stream, item in events(tmp_path / "out.mcap") if stream in ("left", "right")}
-    frame = images["left"].pair_with(images["right"])
+    frame = frame_of(tmp_path / "out.mcap")
     assert (frame.left.shape, frame.right.shape) == ((16, 24, 3), (16, 24))
 
 
@@ -251,16 +268,6 @@ def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, said)
     assert "2 stereo frames" in text
     read = [item.stamp for _, stream, item in events(tmp_path / "out.mcap") if stream == "left"]
     assert np.diff(read).tolist() == [3_000_000_000]
-
-
-def test_the_devon_pairs_become_a_log(tmp_path):
-    left, right = pair_images(data_folder("devon"))
-    calibration = {"fx": 968.999694824, "cx": 635.139038086, "cy": 463.537109375, "baseline": 0.239977002}
-    import_images(left, right, calibration, tmp_path / "devon.mcap", pitch_down=14.5, height=0.88)
-    images = [item for _, stream, item in events(tmp_path / "devon.mcap") if stream == "left"]
-    assert [image.pixels.shape for image in images] == [(960, 1280, 3)] * 2
-    expected = cv2.imread(str(left[0]))[:, :, ::-1]
-    np.testing.assert_array_equal(images[0].pixels, expected)
 
 
 def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):

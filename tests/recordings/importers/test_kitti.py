@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from recordings.importers.kitti import CALIBRATIONS, IMU_HEIGHT, _calibration, _raw, _rectified, _rigid, read_kitti
 from recordings.importers.rig import Rig
 from recordings.mcap.file import iter_decoded
-from tests.conftest import roverflow
+from tests.conftest import data_folder, roverflow
 from tests.recordings.importers.simulated import (
     EXACT,
     RIG,
@@ -22,7 +22,6 @@ from tests.recordings.importers.simulated import (
     write_images,
     write_lines,
 )
-from tests.recordings.sample_log import data_folder
 
 # Any rotations and places do, if the chain of transforms is right.
 TURNS = [Rotation.from_euler("xyz", angles, degrees=True).as_matrix() for angles in ([1, 2, -1], [88, -3, 91])]

@@ -1,6 +1,5 @@
 """Middlebury scenes become logs with the ground truth of the scene."""
 
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from recordings import McapSource
 from recordings.errors import LogError
 from recordings.importers.middlebury import import_scene, logs_of, read_pfm, read_scene
 from recordings.importers.recording import FIRST_STAMP
@@ -19,23 +17,16 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import from_msg as ros2
 from recordings.ros2.to_msg import disparity_image
 from recordings.scoring import score as scoring
-from recordings.scoring.table import format_score
 from stages.data import Disparity, StereoFrame
+from tests.conftest import data_folder
 from tests.recordings.importers import middlebury_scene as scenes
 from tests.recordings.importers.middlebury_scene import write_pfm, write_scene
-from tests.recordings.sample_log import data_folder
+from tests.recordings.sample_log import frame_of
 
 
 def imported(folder: Path) -> tuple[Path, str]:
     log = folder.with_suffix(".mcap")
     return log, import_scene(folder, log)
-
-
-def frame_of(log: Path) -> StereoFrame:
-    with McapSource().open(log) as opened:
-        assert set(opened.missing) == {"odometry"}
-        images = {stream: item for _, stream, item in opened.events() if stream in ("left", "right")}
-    return images["left"].pair_with(images["right"])
 
 
 def truth_of(log: Path) -> dict[str, Any]:
@@ -74,17 +65,6 @@ def test_images_and_camera_of_a_scene_are_in_its_log(tmp_path):
     assert (camera.baseline, camera.width, camera.height, camera.raw) == (0.25, 96, 64, None)
 
 
-def test_a_plane_has_its_distance(tmp_path):
-    """Z = baseline * f / (d + doffs): 0.25 m * 100 px / (5 + 12.5) px, the box at 25 / 25.5."""
-    log, _ = imported(write_scene(tmp_path / "Box"))
-    message, camera = truth_of(log)["/truth/disparity"], frame_of(log).camera
-    distance = message.f * message.t / ros2.read_disparity(message)
-    assert distance[50, 20] == pytest.approx(25 / 17.5)
-    assert distance[20, 50] == pytest.approx(25 / 25.5)
-    ours = camera.fx * camera.baseline / (scenes.true_disparity() + camera.cx_right - camera.cx)
-    np.testing.assert_allclose(distance[np.isfinite(distance)], ours[np.isfinite(distance)], rtol=1e-6)
-
-
 def test_the_truth_is_that_of_the_scene(tmp_path):
     log, words = imported(write_scene(tmp_path / "Box"))
     assert "with true disparities and occlusions" in words
@@ -100,38 +80,6 @@ def test_the_truth_is_that_of_the_scene(tmp_path):
     with log.open("rb") as stream:
         about = next(record for record in make_reader(stream).iter_metadata() if record.name == "middlebury")
     assert (about.metadata["scene"], about.metadata["ndisp"]) == ("Box", "21")
-
-
-def test_the_score_counts_known_errors_exactly(tmp_path):
-    log, _ = imported(write_scene(tmp_path / "Box"))
-    frame, true, mask = frame_of(log), scenes.true_disparity(), scenes.occlusion()
-    pixels = np.where(np.isfinite(true), true, np.float32(9))
-    pixels[20:24] += 0.75
-    pixels[30:33] -= 3
-    pixels[40:45, 30:] = np.nan
-    pixels[50] += 5
-    found = scoring.score(result(log, frame, pixels), log)
-    known, error = np.isfinite(pixels), np.abs(np.nan_to_num(pixels) - true)
-    right = np.arange(scenes.WIDTH) >= 32  # 21 rounded up to 16
-    for image, place in (("whole_image", np.ones(scenes.WIDTH, bool)), ("cropped_image", right)):
-        regions = {"nonocc": mask == 255, "all": np.isfinite(true), "occluded": mask == 128}
-        for name, region in regions.items():
-            counted, problems = region & place, found.disparity[image][name]
-            assert problems["pixels"] == counted.sum()
-            assert problems["density"] == (counted & known).sum() / counted.sum()
-            for limit in (0.5, 1, 2, 4):
-                bad = counted & (~known | (error > limit))
-                assert problems[f"bad_{limit:g}"] == bad.sum() / counted.sum()
-            errors = error[counted & known].astype(np.float64)
-            assert problems["rmse"] == pytest.approx(math.sqrt(np.mean(errors**2)))
-            assert problems["mae"] == pytest.approx(np.mean(errors))
-    assert found.disparity["given_without_truth"]["pixels"] == np.isinf(true).sum()
-    assert found.missing == found.unmatched == {}  # maps without truth are not expected
-    table = format_score(found)
-    assert "without the leftmost 32 columns" in table
-    counted = mask == 255
-    bad = 100 * np.sum(counted & (~known | (error > 2))) / counted.sum()
-    assert f"{bad:.2f}%" in next(line for line in table.splitlines() if "seen by both" in line)
 
 
 def test_either_name_of_the_truth_is_read(tmp_path):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.importers.katwijk import CAMERA_ON_IMU
 from recordings.mcap.file import iter_decoded
-from tests.conftest import roverflow
+from tests.conftest import data_folder, roverflow
 from tests.recordings.importers.simulated import (
     EXACT,
     assert_same,
@@ -21,7 +21,6 @@ from tests.recordings.importers.simulated import (
     write_images,
     write_lines,
 )
-from tests.recordings.sample_log import data_folder
 
 # The camera of Katwijk looks down by about 18 degrees.
 PITCH = float(np.arcsin(-CAMERA_ON_IMU.rotation[2, 2]))

@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 from recordings.inertial.blocks import InertialSample
 from recordings.inertial.up_estimator import UpEstimator
 from stages.data import Tilt
-from tests.conftest import slow
+from tests.conftest import data_folder, slow
 from tests.recordings.inertial.drive import drive, estimated
-from tests.recordings.sample_log import data_folder
 
 
 def rms(values):

@@ -25,8 +25,8 @@ from recordings.inventory.text import format_description
 from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
-from tests.conftest import chunks_of, rewrite, with_broken, write_mcap
-from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, data_folder, essences, inventory_of, items_of, sound
+from tests.conftest import chunks_of, data_folder, rewrite, with_broken, write_mcap
+from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, essences, inventory_of, items_of, sound
 
 
 def record(opcode: int, content: bytes) -> bytes:

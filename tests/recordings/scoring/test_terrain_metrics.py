@@ -123,11 +123,11 @@ def test_unknown_is_neither_a_false_alarm_nor_a_detection():
     truth = flat_truth(((4.0, 0.0, 0.5, 0.25, 400.0, 0.9), (-3.0, 0.0, 0.5, 0.25, 0.0, 0.0)))
     nothing = scored(truth, {}, None)
     assert nothing["hazards"]["unknown"] == 1
-    assert nothing["hazards"]["false_alarm"] == nothing["hazards"]["recall"] == 0
-    assert nothing["rocks"]["0.2 m"]["detected"] == 0
+    assert nothing["hazards"]["false_alarm"] == nothing["hazards"]["recall"] == nothing["hazards"]["false_safe"] == 0
+    assert nothing["rocks"]["0.2 m"]["detected"] == nothing["rocks"]["0.2 m"]["recall"] == 0
     free = scored(truth, {}, np.zeros((N, N), np.int8))["hazards"]
     assert free["free_on_rock"] == pytest.approx(np.count_nonzero(truth.rock) / N**2)
-    assert free["rock_false_safe"] == 1
+    assert free["rock_false_safe"] == free["false_safe"] == 1
     alarmed = np.where(Y > 0, Cell.HAZARD, Cell.UNKNOWN).astype(np.int8)
     hazards = scored(truth, {}, alarmed)["hazards"]
     assert hazards["false_alarm"] == hazards["by_slope"]["5-10 deg"] == pytest.approx(0.5, abs=0.01)

@@ -404,8 +404,6 @@ def test_a_log_of_any_seed_has_stamps_that_can_be_written(seed):
 def test_an_impossible_simulation_is_refused_with_the_parameters_name():
     with pytest.raises(ValueError, match="relief_cells must be a power of two"):
         Simulation(relief_cells=1000)
-    with pytest.raises(ValueError, match=r"abundance must be at most 0\.5, not 2"):
-        Simulation(abundance=2)
     with pytest.raises(ValueError, match="frames must be at least 1, not 0"):
         Simulation(frames=0)
 

@@ -278,17 +278,6 @@ def test_frame_level_has_one_parent_though_the_first_frame_has_no_pose(tmp_path)
     assert parents == {("left_optical", LEVEL_FRAME), (LEVEL_FRAME, "odom"), ("odom", "tf#/")}
 
 
-def test_equal_drives_give_equal_bytes(tmp_path):
-    for name in ("a.mcap", "b.mcap"):
-        fuse, sink = Fusing(), McapSink()
-        sink.open(tmp_path / name, {"regional_map": ElevationMap}, ABOUT)
-        for frame in range(3):
-            cloud, pose = drive(frame)
-            sink.write(Record(cloud.stamp, {"regional_map": fuse(cloud, pose, MOUNT)}))
-        sink.close({})
-    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
-
-
 def test_no_rounding_keeps_every_bit(tmp_path):
     exact = {"disparity_step": 0.0, "point_spacing": 0.0, "length_step": 0.0, "precision": 0.0}
     sink, sent = McapSink(**exact), items(START)
