@@ -93,6 +93,14 @@ def slow(*cases: Any) -> list[Any]:
     return [pytest.param(*values, marks=pytest.mark.slow) for values in several]
 
 
+def data_folder(name: str) -> Path:
+    """A folder of the real data, or a skip with its name."""
+    folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / name
+    if "ROVERFLOW_DATA" not in os.environ or not folder.exists():
+        pytest.skip(f"needs the real data: set ROVERFLOW_DATA to the folder with {name}")
+    return folder
+
+
 def roverflow(*arguments: object) -> int:
     """What the command line makes of these arguments."""
     return main([str(argument) for argument in arguments])
@@ -219,3 +227,12 @@ def edit_of(topic: str, schema: str, edit: Callable[[int, Any], object]) -> Call
         return bytes(standard_types().serialize_cdr(message, schema))
 
     return change
+
+
+def an_hour_later(source: Path, out: Path) -> Path:
+    """Copy a log with images whose header stamps are an hour later."""
+
+    def later(index: int, image: Any) -> None:
+        image.header.stamp.sec += 3600
+
+    return rewrite(source, out, edit_of("/image_rect_color", "sensor_msgs/msg/Image", later))

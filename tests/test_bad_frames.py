@@ -137,17 +137,6 @@ def test_a_run_without_points_writes_no_map(traverse, tmp_path, said):
     assert not counts.keys() & set(MAPS)
 
 
-def test_a_missing_baseline_is_reported_in_one_sentence(traverse, tmp_path, refused):
-    def unknown(index, info):
-        info.p = np.where(np.arange(12) == 3, 0.0, info.p)
-
-    change = edit_of("/stereo/right/camera_info", "sensor_msgs/msg/CameraInfo", unknown)
-    without = lambda topic, *more: None if topic == "/tf_static" else change(topic, *more)  # noqa: E731
-    log = rewrite(traverse, tmp_path / "log.mcap", without)
-    assert "does not contain the baseline" in refused("run", log, "-o", tmp_path / "out.mcap", "--no-rrd")
-    assert not (tmp_path / "out.mcap").exists()
-
-
 @dataclass(frozen=True)
 class WithoutNaN(Stage):
     """Writes a number in place of NaN."""

@@ -17,13 +17,11 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from scipy.spatial.transform import Rotation
 
 from recordings.containers.container import RawMessage
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.ros2.from_msg import read_disparity, stamp_of
+from recordings.ros2.from_msg import read_disparity, read_grid_map, stamp_of
 from recordings.simulator import Simulation, write_log
 from recordings.simulator.traverse import level_pose
 from recordings.sinks.mcap_sink import McapSink
@@ -92,7 +90,9 @@ def test_a_log_without_a_pose_gets_a_visual_one_named_as_such(traverse, tmp_path
     log = rewrite(traverse, tmp_path / "log.mcap", lambda topic, _, data: None if topic in poses else data)
     out, summary = tmp_path / "out.mcap", tmp_path / "out.json"
     printed = said(0, "run", log, *SMALL, "-o", out, "--no-rrd", "--summary", summary).out
-    written = [message for topic, _, message in iter_decoded(out) if topic == "/nav/pose"]
+    written, regional = (
+        [message for _, _, message in iter_decoded(out, [topic])] for topic in ("/nav/pose", "/nav/regional_map")
+    )
     assert [(pose.header.frame_id, pose.child_frame_id) for pose in written] == [("visual_odom", "base_link")] * FRAMES
     simulation = Simulation(**TRAVERSE)
     start = level_pose(simulation.base_at(simulation.stamp(0))).inverse()
@@ -103,6 +103,8 @@ def test_a_log_without_a_pose_gets_a_visual_one_named_as_such(traverse, tmp_path
     sentence = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
     assert json.loads(summary.read_text())["findings"]["pose"]["sentence"] == sentence
     assert f"pose: {sentence}" in printed
+    assert {message.header.frame_id for message in regional} == {"visual_odom"}
+    assert read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
 
 
 def test_a_logged_pose_is_kept_and_the_tilt_is_still_checked(result):
@@ -139,14 +141,6 @@ def test_a_row_offset_is_measured_once_for_the_log_reported_and_corrected(traver
     images = [{m for m in raw_messages(path) if m[0] == "/nav/disparity"} for path in (whole, part)]
     assert images[1] < images[0]  # the same messages, though the run saw but a part
     assert images[1]
-
-
-def test_the_result_reads_back_with_mcap_ros2_support(result):
-    with result.open("rb") as stream:
-        decoded = list(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages())
-    assert len(decoded) == len(raw_messages(result))
-    grid = next(item.decoded_message for item in decoded if item.channel.topic == "/nav/navigation_map")
-    assert set(np.unique(np.array(grid.data))) <= {-1, 0, 100}
 
 
 def test_the_result_reads_back_with_rosbags(result):
@@ -199,43 +193,6 @@ def test_results_do_not_depend_on_the_number_of_workers(traverse, tmp_path, pipe
         logs.append(raw_messages(out))
     assert len(logs[0]) >= 6 * FRAMES
     assert logs[0] == logs[1]
-
-
-def test_the_pose_comes_from_tf_if_so_configured(traverse, tmp_path):
-    """The simulator's /odometry is left out; its pose is written as /tf among another transform."""
-    from recordings.mcap.writer import Ros2Writer
-    from recordings.ros2.to_msg import transform_message
-    from recordings.source.mcap_source import McapSource
-    from stages.data import Pose, Transform
-
-    log = tmp_path / "tf.mcap"
-    with McapSource().open(traverse) as opened:
-        poses = [item for _, stream, item in opened.events() if stream == "odometry"]
-    with Ros2Writer(log) as writer:
-        for topic, stamp, message in iter_decoded(traverse):
-            if not topic.startswith(("/truth", "/odometry", "/tf")) or topic == "/tf_static":
-                writer.write(topic, message, stamp)
-        for pose in poses:
-            wheel = Transform("base_link", "wheel", np.eye(3), np.zeros(3))
-            at = Transform(pose.frame_id, "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
-            writer.write("/tf", transform_message([(wheel, pose.stamp), (at, pose.stamp)]), pose.stamp)
-    with McapSource(odometry="/tf").open(log) as opened:
-        read = [item for _, stream, item in opened.events() if stream == "odometry"]
-    assert all(isinstance(pose, Pose) for pose in read)
-    assert [pose.stamp for pose in read] == [pose.stamp for pose in poses]
-    np.testing.assert_allclose([p.position for p in read], [p.position for p in poses], atol=1e-12)
-    assert roverflow("run", log, *SMALL, "--set", "source.odometry=/tf", "-o", tmp_path / "out.mcap", "--no-rrd") == 0
-
-
-def test_a_damaged_image_costs_its_frame_and_nothing_else(traverse, tmp_path, said):
-    def damage(topic, index, data):
-        return data[: len(data) // 2] if topic.endswith("left/image_rect_color") and index == 1 else data
-
-    log = rewrite(traverse, tmp_path / "damaged.mcap", damage)
-    out = tmp_path / "out.mcap"
-    assert "INCOMPLETE" in said(3, "run", log, *SMALL, "-o", out, "--no-rrd").out
-    counts = Counter(topic for topic, _, _ in raw_messages(out))
-    assert counts["/nav/navigation_map"] == FRAMES - 1
 
 
 @pytest.mark.parametrize(("part", "compared"), [

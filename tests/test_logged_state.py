@@ -1,6 +1,5 @@
 """`roverflow try --result`: the state before an instant comes from the result log."""
 
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from flow.cli.what_if import run_variants
 from flow.runtime.variants import merged
 from recordings.results import read_result
 from stages import FuseRegion
-from tests.conftest import SMALL, edit_of, rewrite, roverflow, slow
+from tests.conftest import SMALL, an_hour_later, edit_of, rewrite, roverflow, slow
 
 AT = 1.5  # s, the last frame
 HEIGHT_STEP = 1 / 1024  # m, to which the log rounds heights
@@ -151,11 +150,7 @@ def test_a_result_without_the_state_of_each_frame_is_refused(traverse, option, s
 
 
 def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, refused):
-    def later(topic, index, data):  # by an hour, in the header
-        return data[:4] + struct.pack("<i", struct.unpack("<i", data[4:8])[0] + 3600) + data[8:]
-
-    rest, images = (*SMALL, "-o", tmp_path / "try.rrd"), ("left/image_rect_color", "right/image_rect_color")
-    other = rewrite(traverse, tmp_path / "b.mcap", lambda *one: later(*one) if one[0].endswith(images) else one[2])
+    rest, other = (*SMALL, "-o", tmp_path / "try.rrd"), an_hour_later(traverse, tmp_path / "b.mcap")
     for log, result, more, why in (
         (other, fast_result, (), f"{other} is not the input of {fast_result}: its frames have other stamps\n"),
         (traverse, fast_result, ("-p", "rover"), f"the pipeline is that of {fast_result}; leave out -p\n"),

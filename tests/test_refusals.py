@@ -373,7 +373,6 @@ def test_a_pipeline_of_nested_aliases_is_refused_at_once(tmp_path, refused):
 
 @pytest.mark.parametrize(("settings", "printed"), [
     (["max_range=1km"], "stages.Clean.max_range: must be at most 200 m, not 1km"),
-    (["rover.wheel=1km"], "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
     (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
     (["regional_cells.max_range=200m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
     (["regional_elevation.window=400m"], "stages.MapRegion.window: must be at most 200 m, not 400m"),

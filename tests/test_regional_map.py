@@ -11,7 +11,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2 import from_msg as ros2
 from stages.data import Cell, CellReason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
-from tests.conftest import FRAMES, SMALL, rewrite, roverflow
+from tests.conftest import FRAMES, SMALL, roverflow
 
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
 
@@ -52,15 +52,6 @@ def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
         for state, reasons_of_state in expected.items():
             assert set(np.unique(navigation.reason[navigation.cells == state]).tolist()) <= {*reasons_of_state}
         assert CellReason.STEP in navigation.reason
-
-
-def test_a_log_without_a_pose_has_a_regional_map_by_visual_odometry(traverse, tmp_path):
-    log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
-    rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
-    assert roverflow("run", log, *SMALL, "-o", out, "--no-rrd") == 0
-    regional = [message for _, _, message in iter_decoded(out, ["/nav/regional_map"])]
-    assert {message.header.frame_id for message in regional} == {"visual_odom"}
-    assert ros2.read_grid_map(regional[-1]).layers["frames"].max() == FRAMES
 
 
 def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, refused):
@@ -117,9 +108,3 @@ def test_an_impossible_export_is_refused_in_one_sentence(result, tmp_path, where
     log = tmp_path / "gone.mcap" if where == "gone" else result
     assert words in refused("export", log, tmp_path / where if where != "gone" else tmp_path / "maps")
     assert (tmp_path / "file").read_text() == "mine"
-
-
-def test_an_export_below_a_file_names_folder_and_reason(result, tmp_path, said):
-    (tmp_path / "file").write_text("mine")
-    folder = tmp_path / "file" / "maps"
-    assert f"cannot write {folder}: Not a directory; choose another place" in said(1, "export", result, folder).err

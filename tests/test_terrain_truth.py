@@ -61,15 +61,9 @@ def traverse_of(seed: int, abundance: float, scene: str = "mixed") -> Simulation
     )  # fmt: skip
 
 
-def test_a_frame_has_an_accurate_map():
-    found = score([traverse_of(14, 0.15)], 30, COMPARED)
-    assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
-    check(found, alarms=0.08, slack=0.04)
-
-
-@pytest.mark.slow
-def test_two_frames_have_accurate_maps():
-    found = score([traverse_of(11, 0.15)], 15, COMPARED)
+@pytest.mark.parametrize(("seed", "every"), [(14, 30), *slow((11, 15))])
+def test_one_or_two_frames_have_accurate_maps(seed, every):
+    found = score([traverse_of(seed, 0.15)], every, COMPARED)
     assert found["rover"].tally.metrics()["rocks"]["0.2 m"]["visible"] >= 1
     check(found, alarms=0.08, slack=0.04)
 

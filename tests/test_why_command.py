@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import struct
 
 import cv2
 import numpy as np
@@ -18,7 +17,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
-from tests.conftest import FRAMES, SMALL, edit_of, rewrite, roverflow, slow
+from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, rewrite, roverflow, slow
 
 AT = 1.0
 
@@ -145,11 +144,7 @@ def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, said)
 
 @pytest.mark.parametrize("regional", [(), ("--map", "regional_navigation_map")])
 def test_a_log_of_other_stamps_is_not_taken_for_the_input(traverse, fast_result, tmp_path, refused, regional):
-    def later(topic, index, data):
-        return data[:4] + struct.pack("<i", struct.unpack("<i", data[4:8])[0] + 3600) + data[8:]
-
-    images = ("/stereo/left/image_rect_color", "/stereo/right/image_rect_color")
-    other = rewrite(traverse, tmp_path / "b.mcap", lambda *one: later(*one) if one[0] in images else one[2])
+    other = an_hour_later(traverse, tmp_path / "b.mcap")
     words = ("--at", AT, "--cell", "3,0", *regional)
     sentence = refused("why", fast_result, *words, "--log", other)
     assert f"b.mcap is not the input of {fast_result}: its frames have other stamps; give traverse.mcap\n" in sentence

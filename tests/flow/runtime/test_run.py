@@ -71,18 +71,14 @@ def test_an_unreadable_message_and_a_repeated_stamp_are_in_the_ledger(tmp_path):
     assert len(sink.values("raised")) == 4
 
 
-def test_a_result_of_the_wrong_type_fails_the_frame_not_the_run(tmp_path):
-    text = PIPELINE.replace("tests.flow.toys.Add, a: sum, b: height", "tests.flow.toys.Liar, couple: sum")
+@pytest.mark.parametrize(("stage", "why"), [
+    ("Liar", "returned Text, not Couple"), ("Late", "returned the stamp 1 ns, not that of its frame"),
+])  # fmt: skip
+def test_a_result_of_the_wrong_type_or_stamp_fails_the_frame_not_the_run(tmp_path, stage, why):
+    text = PIPELINE.replace("tests.flow.toys.Add, a: sum, b: height", f"tests.flow.toys.{stage}, couple: sum")
     _, summary = replayed(graph(tmp_path, text=text), traverse(2))
     assert summary["drops"] == {"failed": 2}
-    assert "returned Text, not Couple" in summary["ledger"][0]["detail"]
-
-
-def test_a_result_with_another_stamp_fails_the_frame_not_the_run(tmp_path):
-    text = PIPELINE.replace("tests.flow.toys.Add, a: sum, b: height", "tests.flow.toys.Late, couple: sum")
-    _, summary = replayed(graph(tmp_path, text=text), traverse(2))
-    assert summary["drops"] == {"failed": 2}
-    assert summary["ledger"][0]["detail"] == "tests.flow.toys.Late returned the stamp 1 ns, not that of its frame"
+    assert f"tests.flow.toys.{stage} {why}" in summary["ledger"][0]["detail"]
 
 
 def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):

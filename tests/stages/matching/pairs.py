@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from stages.data import StereoCamera, StereoFrame
+from stages.data import PixelOrigin, StereoCamera, StereoFrame
 
 
 def frame_of(left, right):
@@ -26,3 +26,14 @@ def slanted_pair(height=200, width=320, near=34.0, far=6.0):
     left = cv2.remap(wide, x + 40 - disparity, y, cv2.INTER_CUBIC)  # x_right = x_left - d
     left, right = (np.round(image).clip(0, 255).astype(np.uint8) for image in (left, right))
     return frame_of(left, right), disparity
+
+
+def check_in_view(result, least, most):
+    """Known disparities lie within these and their partners in the right image; no other pixel has a confidence."""
+    known = np.isfinite(result.pixels)
+    partner = (np.arange(known.shape[1]) - result.pixels)[known]
+    assert ((partner >= 0) & (partner <= known.shape[1] - 1)).all()
+    assert ((result.pixels[known] >= least) & (result.pixels[known] <= most)).all()
+    assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
+    assert (result.confidence[~known] == 0).all()
+    return known

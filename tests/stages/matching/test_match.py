@@ -20,7 +20,8 @@ from stages.data import Disparity, PixelOrigin, StereoFrame
 from stages.matching.match import COSTS, LEADS, Match
 from stages.matching.match_opencv import MatchOpenCV
 from tests.bench.stereo_scores import load_scene, rows_filled
-from tests.stages.matching.pairs import frame_of, slanted_pair, textured
+from tests.conftest import data_folder
+from tests.stages.matching.pairs import check_in_view, frame_of, slanted_pair, textured
 
 ROOT = Path(__file__).parents[3]
 REASONS = range(PixelOrigin.OUT_OF_VIEW, PixelOrigin.BLANK + 1)
@@ -139,6 +140,8 @@ def test_what_lies_beyond_max_depth_is_neither_searched_nor_made_up(slope):
     assert np.isfinite(near[visible & (truth > 20) & (truth < 21)]).mean() > 0.8
     result = match(frame, prior)
     assert not result.confidence[np.isnan(result.pixels)].any()
+    beyond = result.source[(truth < 18) & (np.arange(320) > 40)]
+    assert (beyond == PixelOrigin.OUT_OF_RANGE).mean() > 0.5
     assert np.nanmedian(np.abs(near - whole)[within]) < 0.02
     # A camera whose principal points differ sees the same depth at another disparity.
     moved = replace(frame, camera=replace(frame.camera, cx_right=frame.camera.cx + 5))
@@ -155,7 +158,7 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
     bare, joined = Match(disparities=24)(frame, prior), Match(disparities=24, out_of_range="prior")(frame, prior)
     nearer = known & (truth > 22.5)
     assert nearer.sum() > 1000
-    assert np.isnan(bare.pixels[known & (truth > 26.5)]).all()
+    assert (bare.source[known & (truth > 26.5)] == PixelOrigin.OUT_OF_RANGE).all()
     np.testing.assert_array_equal(joined.pixels[known & (truth > 26.5)], prior.pixels[known & (truth > 26.5)])
     assert np.isfinite(joined.pixels[nearer]).all()  # the end of the range, where the search also loses some
     assert np.abs(joined.pixels - truth)[nearer].max() < 1
@@ -199,15 +202,9 @@ def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, dispariti
     right = np.roll(left, -5, axis=1)
     match = Match(disparities=disparities, min_disparity=minimum, paths=paths, cost=cost)
     result = match(frame_of(left, right))
-    known = np.isfinite(result.pixels)
-    partner = (np.arange(w) - result.pixels)[known]
-    assert ((partner >= 0) & (partner <= w - 1)).all()
-    assert (result.pixels[known] >= minimum).all()
-    assert (result.pixels[known] <= minimum + disparities - 1).all()
-    assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
+    known = check_in_view(result, minimum, minimum + disparities - 1)
     assert np.isin(result.source[~known], REASONS).all()
     assert (result.confidence[known] > 0).all()
-    assert (result.confidence[~known] == 0).all()
     assert same(result, replace(match, threads=2)(frame_of(left, right)))
 
 
@@ -371,11 +368,8 @@ def test_processors_without_avx512_give_the_same_bits(processor):
 
 
 def test_real_scenes_are_matched_better_than_by_opencv():
-    folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / "middlebury-q"
-    if not folder.is_dir():
-        pytest.skip("ROVERFLOW_DATA names no folder with middlebury-q")
     scores = []
-    for scene in sorted(folder.iterdir()):
+    for scene in sorted(data_folder("middlebury-q").iterdir()):
         frame, truth, mask, levels = load_scene(scene)
         matcher = cv2.StereoSGBM.create(0, levels, 5, 300, 2850, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
         sixteenths = matcher.compute(frame.left[..., ::-1], frame.right[..., ::-1])

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.data import PixelOrigin
 from stages.matching.match_opencv import MatchOpenCV
-from tests.stages.matching.pairs import frame_of, slanted_pair, textured
+from tests.stages.matching.pairs import check_in_view, frame_of, slanted_pair, textured
 
 
 @settings(max_examples=12, deadline=None)
@@ -22,13 +21,7 @@ def test_any_size_gives_disparities_in_range_and_in_the_right_image(h, w, paths,
     left = textured(h, w, seed).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
     result = MatchOpenCV(disparities=disparities, min_disparity=minimum, paths=paths)(frame_of(left, right))
-    known = np.isfinite(result.pixels)
-    partner = (np.arange(w) - result.pixels)[known]
-    assert ((partner >= 0) & (partner <= w - 1)).all()
-    assert (result.pixels[known] >= minimum).all()
-    assert (result.pixels[known] <= minimum + -(-disparities // 16) * 16).all()
-    assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
-    assert (result.confidence[~known] == 0).all()
+    check_in_view(result, minimum, minimum + -(-disparities // 16) * 16)
     assert ((result.confidence >= 0) & (result.confidence <= 1)).all()
 
 

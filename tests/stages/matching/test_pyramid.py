@@ -116,14 +116,6 @@ def test_a_frame_too_small_to_halve_names_its_own_size_and_the_way_out():
     assert Match(disparities=8)(half).pixels.shape == (16, 40)
 
 
-def test_what_the_prior_shows_nearer_than_the_range_is_unknown():
-    frame, truth = slope_frame()
-    prior = Disparity(7, truth, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
-    found = Match(disparities=13, max_speckle_size=0)(frame, prior)
-    assert np.isnan(found.pixels[truth > 15.5]).all()
-    assert np.isfinite(found.pixels[(truth < 11) & (np.arange(131) > 30)]).mean() > 0.9
-
-
 @given(st.integers(1, 9), st.integers(1, 9), st.booleans(), st.booleans(), st.integers(0, 99))
 def test_doubling_is_its_reference_at_any_size(rows, columns, odd_rows, odd_columns, seed):
     rng = np.random.default_rng(seed)

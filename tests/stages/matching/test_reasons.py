@@ -62,15 +62,6 @@ def test_what_the_right_image_does_not_show_is_out_of_view(slope, stage):
     assert (shifted.source[:, :7] == PixelOrigin.OUT_OF_VIEW).all()
 
 
-def test_what_the_prior_has_nearer_than_the_range_is_out_of_range(slope):
-    frame, truth = slope
-    prior = Disparity(frame.stamp, truth, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
-    found = Match(disparities=24)(frame, prior)
-    assert share(found, PixelOrigin.OUT_OF_RANGE, truth > 26.5) == 1
-    deep = Match(disparities=48, max_depth=1.5)(frame, prior)  # 20 px
-    assert share(deep, PixelOrigin.OUT_OF_RANGE, (truth < 18) & (np.arange(320) > 40)) > 0.5
-
-
 def test_the_reason_of_a_prior_passes_where_nothing_is_searched(slope):
     frame, truth = slope
     holed, origin = truth.copy(), np.ones(truth.shape, np.uint8)

@@ -1,6 +1,5 @@
 """Depth edges: the choice of a surface equals the plain reference and moves an edge to where the images have it."""
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,32 +27,17 @@ def test_the_choice_equals_its_reference(height, width, radius, seed, channels):
     np.testing.assert_array_equal(sharp, sharpen_edges(*everything, threads=2))
 
 
-def test_a_misplaced_depth_edge_moves_onto_the_image_edge():
-    image = np.full((40, 60), 80, np.uint8)
-    image[:, 30:] = 140
-    truth = np.where(image > 100, np.float32(30), np.float32(10))
-    off = truth.copy()
-    off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 10
+@pytest.mark.parametrize("shades", [((80, 80, 80), (140, 140, 140)), ((120, 90, 100), (90, 106, 98))])
+def test_a_misplaced_depth_edge_moves_onto_the_image_edge(shades):
+    """Also onto one that only colours show, and by two pixels."""
+    image = np.full((40, 60, 3), shades[0], np.uint8)
+    image[:, 30:] = shades[1]
+    truth = np.full((40, 60), 10, np.float32)
+    truth[:, 30:] = 30
+    off, farther = truth.copy(), truth.copy()
+    off[:20, 29], off[20:, 30], off[::7, 30], farther[:, 28:30] = 30, 10, 10, 30
     assert np.array_equal(sharpened(off, image), truth)
-
-
-def test_colours_move_an_edge_that_gray_levels_do_not_show():
-    image = np.full((40, 60, 3), (120, 90, 100), np.uint8)
-    image[:, 30:] = 90, 106, 98
-    assert np.ptp(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) <= 1
-    truth = np.where(image[..., 0] < 100, np.float32(30), np.float32(10))
-    off = truth.copy()
-    off[:20, 29], off[20:, 30], off[::7, 30] = 30, 10, 10
-    assert np.array_equal(sharpened(off, image), truth)
-
-
-def test_an_edge_that_is_two_pixels_off_moves_twice():
-    image = np.full((40, 60), 80, np.uint8)
-    image[:, 30:] = 140
-    truth = np.where(image > 100, np.float32(30), np.float32(10))
-    off = truth.copy()
-    off[:, 28:30] = 30
-    assert np.array_equal(sharpened(off, image), truth)
+    assert np.array_equal(sharpened(farther, image), truth)
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.85, 12.0)])

@@ -64,25 +64,11 @@ def test_weights_count_in_the_least_squares_as_in_the_reference(tiles):
     assert np.abs(images[0] - unweighted).max() > 1e-3
 
 
-def test_two_threads_give_the_same_planes(tiles):
-    disparity, labels, _ = tiles
-    one, two = (fit_planes(disparity, labels, 6, ALIKE, 64, threads=n) for n in (1, 2))
-    for ours, theirs in zip(one, two, strict=True):
-        assert np.array_equal(ours, theirs)
-
-
 def test_a_segment_is_fitted_alike_whatever_the_others_hold(tiles):
     disparity, labels, _ = tiles
     alone = np.where(labels == 4, disparity, np.float32(np.nan))
     among, single = (fit_planes(given, labels, 6, ALIKE, 64, seed=9).coefficients for given in (disparity, alone))
     assert np.array_equal(among[4], single[4])
-
-
-def test_the_seed_decides_the_draws(tiles):
-    disparity, labels, _ = tiles
-    runs = [fit_planes(disparity, labels, 6, ALIKE, 1, seed=seed).coefficients for seed in (1, 1, 2, -1)]
-    assert np.array_equal(runs[0], runs[1], equal_nan=True)
-    assert not np.array_equal(runs[0], runs[2], equal_nan=True)
 
 
 def test_too_few_or_collinear_pixels_give_no_plane():

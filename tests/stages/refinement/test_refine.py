@@ -164,7 +164,7 @@ def test_the_stamp_decides_every_bit(box, parameters, min_valid, monkeypatch):
     frame, matches, _ = box
     # Of one draw another seed makes another plane; so sure of matches, only those of surfaces are accepted.
     refine = Refine(min_superpixel_size=1, hypotheses=1, **parameters)
-    again, other = (refine(replace(frame, stamp=n), replace(matches, stamp=n)) for n in (5, 6))
+    again, other = (refine(replace(frame, stamp=n), replace(matches, stamp=n)) for n in (5, -6))
     first = refine(frame, matches)
     assert bits(again) == bits(first)
     assert again.segments.max() > 30

@@ -1,8 +1,5 @@
 """The pipelines on scenes with truth: better than matching, the paper and its code, and as sure as they are right."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,6 +10,7 @@ from stages.matching.match import Match
 from tests.bench import weak_texture
 from tests.bench.refining import RELEASED, stereo_part
 from tests.bench.stereo_scores import errors, rows_filled
+from tests.conftest import data_folder
 from tests.study import real, simulated
 
 
@@ -22,13 +20,6 @@ def outcomes(frame, disparities):
     names = ("paper", "fast", "rover", "accurate")
     found = (stereo_part(name, frame, disparities, entry="rectified")["disparity"] for name in names)
     return [matched, *(disparity.pixels for disparity in found)]
-
-
-def real_cases():
-    folder = Path(os.environ.get("ROVERFLOW_DATA", "")) / "middlebury-q"
-    if not folder.is_dir():
-        pytest.skip("ROVERFLOW_DATA names no folder with middlebury-q")
-    return list(real(folder))
 
 
 def test_on_a_simulated_frame_rover_beats_paper_and_matching_alone():
@@ -55,7 +46,7 @@ def test_support_removes_errors_on_sand_and_dust_and_adds_none_elsewhere():
 
 @pytest.mark.slow
 def test_rover_beats_paper_matching_and_the_released_code_on_real_scenes():
-    cases = real_cases()
+    cases = list(real(data_folder("middlebury-q")))
     scores = [[errors(p, c.truth, c.mask, c.disparities) for p in outcomes(c.frame, c.disparities)] for c in cases]
     released = np.array([RELEASED[case.name] for case in cases])
     matched, paper, fast, rover, accurate = np.mean(scores, axis=0)
@@ -121,7 +112,7 @@ def test_confidence_is_the_share_that_is_right_on_a_held_out_frame():
 @pytest.mark.slow
 def test_confidence_is_the_share_right_of_real_and_of_simulated_pixels():
     pools = []
-    for cases in (simulated(), real_cases()):
+    for cases in (simulated(), real(data_folder("middlebury-q"))):
         stated, right = [], []
         for case in cases:
             refined = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]

@@ -241,13 +241,6 @@ def test_a_map_without_terrain_features_is_refused() -> None:
         Binarise()(map_of(np.zeros((40, 40))))
 
 
-def test_a_pit_is_a_hazard() -> None:
-    x, y = grid()
-    pit = np.hypot(x - 2, y - 2) < 0.25
-    result = decided(map_of(np.where(pit, -0.4, 0.0)))
-    assert (result.reason[pit] == CellReason.STEP).all()
-
-
 def test_noise_of_two_centimetres_is_no_hazard() -> None:
     for seed in range(3):
         noise = np.random.default_rng(seed).normal(0, 0.02, (160, 160))

@@ -12,7 +12,6 @@ import pytest
 
 from flow.contracts import StageError
 from stages import Binarise, Cell, Fuse, FuseRegion, PixelOrigin, TerrainFeatures
-from stages.data.tiles import Tiles
 from stages.terrain.fused_map import SHARED_SHARE
 from stages.terrain.map_registration import frame_grid, register
 from tests.conftest import slow
@@ -190,33 +189,6 @@ def test_one_uncertain_frame_does_not_overturn_many():
     terrain = fuse(cloud, pose, MOUNT)
     assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
     assert cell(terrain, 4.02, 0.02, "last") == 5.0
-
-
-def test_the_windows_laid_over_each_other_are_the_whole_map():
-    fuse, whole = Running(Fuse(max_range=7.0, window=17.0)), {}
-    for frame in range(12):
-        cloud, pose = drive(frame, at=(1.5 * frame - 9, 0.3 * frame, 0.2))
-        terrain = fuse(cloud, pose, MOUNT)
-        row, col = (round(place / 0.05) for place in terrain.origin[::-1])
-        for name, layer in terrain.layers.items():
-            whole.setdefault(name, Tiles(np.dtype("f4"))).write(
-                row, col, np.nan_to_num(layer), np.ones(layer.shape, bool)
-            )
-    cells = fuse.state.cells.read(-400, -400, 900, 900)
-    assert (cells["frames"] > 0).sum() > 50_000
-    np.testing.assert_array_equal(whole["elevation"].read(-400, -400, 900, 900), cells["height"])
-    np.testing.assert_array_equal(whole["frames"].read(-400, -400, 900, 900), cells["frames"])
-
-
-def test_equal_frames_give_equal_bits():
-    maps = []
-    for _ in range(2):
-        fuse = Running(Fuse())
-        for frame in range(3):
-            cloud, pose = drive(frame, noise=0.01)
-            terrain = fuse(cloud, pose, MOUNT)
-        maps.append({name: layer.tobytes() for name, layer in terrain.layers.items()})
-    assert maps[0] == maps[1]
 
 
 def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():

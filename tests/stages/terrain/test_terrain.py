@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -32,6 +30,7 @@ from stages.terrain.binarise import Binarise
 from stages.terrain.dem import Voxelise
 from stages.terrain.features import TerrainFeatures
 from stages.terrain.fuse import Fuse
+from tests.conftest import data_folder
 from tests.stages.running import Running
 from tests.stages.terrain.terrain_scene import (
     HEIGHT,
@@ -156,9 +155,7 @@ def test_the_edge_of_a_drop_is_not_free_in_the_regional_map() -> None:
 
 
 def test_the_boulder_of_a_real_scene_stands_on_level_ground() -> None:
-    folder = Path(os.environ.get("ROVERFLOW_DATA", "/nonexistent")) / "devon"
-    if not folder.is_dir():
-        pytest.skip("needs the Devon Island pairs: set ROVERFLOW_DATA to the folder that holds devon/")
+    folder = data_folder("devon")
     left, right = (cv2.cvtColor(cv2.imread(str(folder / f"devon2-{side}.png")), cv2.COLOR_BGR2RGB)
                    for side in ("left", "right"))  # fmt: skip
     # The left image of a point lies 0.6 px lower than its right image in this data set.
