@@ -1,6 +1,6 @@
 """Watching a run: a viewer of this machine, or a browser, which another process serves.
 
-Both get the recording through a pipe (`recordings.sinks.follower`). A viewer that is slow, suspended or closed costs
+Both get the recording through a pipe (`recordings.follower`). A viewer that is slow, suspended or closed costs
 only its own picture: the run waits for it at its end, for 3 s at most.
 """
 

@@ -19,6 +19,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from flow.contracts import FrameRecord, Loss, counted
 from recordings.atomic_write import give_name, room_to_grow, temporary_name, unwritable, writing
+from recordings.follower import Follower
 from recordings.sinks.blueprint import (
     CLOCK,
     FRAME,
@@ -35,7 +36,6 @@ from recordings.sinks.blueprint import (
     ViewSpec,
 )  # fmt: skip
 from recordings.sinks.canvas import CURVE_RGB, Canvas, lines_of
-from recordings.sinks.follower import Follower
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
