@@ -9,21 +9,33 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, lru_cache
+from functools import lru_cache
 from textwrap import wrap
 from typing import Any
 
 import cv2
 import numpy as np
-import pyarrow as pa
 import rerun as rr
 
 from recordings.png import png
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import CURVES, LEDGER, LEDGER_CHARS, Panel, ViewSpec
 from recordings.sinks.colormaps import UNKNOWN_RGB, Legend, Rgb
-from stages.data import Array, ElevationMap, NavigationMap, StereoCamera
+from recordings.sinks.entity_rows import (
+    Component,
+    Drawn,
+    EntityRows,
+    blob,
+    components_of,
+    depth_range,
+    drawn,
+    fields_of,
+    image_format,
+    masking,
+)
+from stages.data import Array, ElevationMap, NavigationMap, StereoCamera, Transform
 
+Sides = tuple[float, float]  # along the width and the height
 TEXT_RGB: Rgb = (225, 228, 235)
 CAMERA_RGB: Rgb = (255, 210, 60)
 VEIL: tuple[int, int, int, int] = (96, 100, 112, 170)  # over guesses
@@ -38,6 +50,7 @@ VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
 LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, share of the picture's height
 ROW_BESIDE = 0.27  # least height of a row of a legend beside the picture, share of the picture's height
 MAX_UNIT_CHARS = 3  # of a unit that stands at each value of a scale; a longer one stands at the last
+CLEARED = components_of(rr.Clear(recursive=False))
 HEADROOM = 0.35  # above the first row of a legend, share of the height of a row
 
 
@@ -71,14 +84,19 @@ class Canvas:
     _present: dict[str, set[int]] = field(default_factory=dict)
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
     _kept: dict[str, Hashable] = field(default_factory=dict)
-    _recurred: dict[str, tuple[rr.DescribedComponentBatch, ...]] = field(default_factory=dict)
+    _recurred: dict[str, tuple[Component, ...]] = field(default_factory=dict)
     _veiled: set[str] = field(default_factory=set)
+    _lenses: dict[str, tuple[Component, ...]] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.rows = EntityRows(self.recording)
+
     def log(self, path: str, archetype: Any, *views: ViewSpec) -> None:
         """Log an entity at the frame's time; views: where the blueprint shows it."""
-        self._log(path, type(archetype), archetype.as_component_batches())
+        shown = archetype if isinstance(archetype, Drawn) else Drawn(type(archetype), components_of(archetype))
+        self._log(path, *shown)
         for view in views:
             self.add_view(view)
 
@@ -86,17 +104,17 @@ class Canvas:
         self,
         path: str,
         kind: type,
-        content: Sequence[rr.DescribedComponentBatch],
-        recurring: tuple[rr.DescribedComponentBatch, ...] = (),
+        content: Sequence[Component],
+        recurring: tuple[Component, ...] = (),
     ) -> None:
         """Log an entity. What recurs is left out while it is that of the last frame, which the viewer then takes."""
         logged = self._recurred.get(path, ()) if path in self._before else ()
-        components = [*content, *(batch for batch in recurring if not any(batch is other for other in logged))]
+        changed = (one for one in recurring if not any(one is other for other in logged))
         self._recurred[path] = recurring
-        rr.log(path, components, recording=self.recording)
+        self.rows.add(path, (*content, *changed))
         self._now[path] = kind
         if self.counts_bytes:
-            self.logged_bytes += sum(batch.as_arrow_array().nbytes for batch in (*content, *recurring))
+            self.logged_bytes += sum(one.content.nbytes for one in (*content, *recurring))
 
     def add_view(self, view: ViewSpec) -> None:
         """Add a view to the blueprint."""
@@ -109,6 +127,13 @@ class Canvas:
         else:
             self._kept[path] = content
             self.log(path, draw())
+
+    def place_camera(self, path: str, place: Transform, focal: Sides, centre: Sides, size: tuple[int, int]) -> None:
+        """A camera's frustum. It stays in a frame without one. focal, centre, size: across and down, px."""
+        lens = _lens(focal, centre, size)
+        known, self._lenses[path] = self._lenses.get(path) is lens, lens
+        posed = components_of(rr.Transform3D(translation=place.translation, mat3x3=place.rotation))
+        self.rows.add(path, posed if known else posed + lens)
 
     def keep_all(self, stream: str) -> None:
         """Leave the entities of a stream as they were in the last frame."""
@@ -164,20 +189,18 @@ class Canvas:
     def log_image(self, path: str, pixels: Array, view: ViewSpec) -> None:
         """An 8-bit image, (H, W) gray or (H, W, 3) RGB, as JPEG."""
         stored = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
-        _, blob = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
-        self.log_blob(path, rr.EncodedImage, blob, view, media_type="image/jpeg")
+        _, jpeg = cv2.imencode(".jpg", stored, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
+        self.log_blob(path, rr.EncodedImage, jpeg, view, media_type="image/jpeg")
 
-    def log_blob(self, path: str, kind: type, blob: bytes | Array, view: ViewSpec, **fields: Any) -> None:
+    def log_blob(self, path: str, kind: type, content: bytes | Array, view: ViewSpec, **fields: Any) -> None:
         """An image that is encoded already, and the other fields of its archetype, which recur."""
-        self._log(path, kind, [_content(kind, "blob", blob)], _recurring(kind, **fields))
+        self._log(path, kind, [blob(kind, "blob", content)], fields_of(kind, **fields))
         self.add_view(view)
 
-    def _log_raw(
-        self, path: str, kind: type, pixels: Array, recurring: tuple[rr.DescribedComponentBatch, ...] = ()
-    ) -> None:
+    def _log_raw(self, path: str, kind: type, pixels: Array, recurring: tuple[Component, ...] = ()) -> None:
         """Log an image that is not encoded."""
-        form = _image_format(kind, pixels.shape, pixels.dtype)
-        self._log(path, kind, [_content(kind, "buffer", pixels)], (*form, *recurring))
+        form = image_format(kind, pixels.shape, pixels.dtype)
+        self._log(path, kind, [blob(kind, "buffer", pixels)], (*form, *recurring))
 
     def log_values(
         self,
@@ -194,12 +217,12 @@ class Canvas:
         """
         low, high = limits
         ends = (low - 0.1 * (high - low), high)
-        colours = _recurring(rr.DepthImage, meter=1.0, colormap=VIEWER_COLORMAPS[palette])
-        self._log_raw(view.path, rr.DepthImage, values, (*colours, _depth_range(ends)))
+        colours = fields_of(rr.DepthImage, meter=1.0, colormap=VIEWER_COLORMAPS[palette])
+        self._log_raw(view.path, rr.DepthImage, values, (*colours, depth_range(ends)))
         self.add_view(view)
         if palette != cv2.COLORMAP_TURBO:  # which begins with nearly black
             mask = np.isnan(values).view(np.uint8)
-            self._log_raw(f"{view.path}/unknown", rr.SegmentationImage, mask, _masking("unknown", UNKNOWN_RGB))
+            self._log_raw(f"{view.path}/unknown", rr.SegmentationImage, mask, masking("unknown", UNKNOWN_RGB))
         if unit is not None:
             self.log_legend(f"{view.path}/scale", values.shape, _scale(low, high, unit, palette, hazard))
 
@@ -226,7 +249,7 @@ class Canvas:
         if faint is not None and (faint.any() or view.path in self._veiled):
             self._veiled.add(view.path)
             mask = np.ascontiguousarray(faint).view(np.uint8)
-            self._log_raw(f"{view.path}/{name}", rr.SegmentationImage, mask, _masking(name, VEIL))
+            self._log_raw(f"{view.path}/{name}", rr.SegmentationImage, mask, masking(name, VEIL))
         entries = [(name, VEIL[:3])] if view.path in self._veiled and faint is not None else []
         self.log_legend(f"{view.path}/scale", steps.shape, [*_scale(0.0, limit, unit, palette), *entries])
 
@@ -264,19 +287,17 @@ class Canvas:
         content, thin = (shape, grid.origin, grid.resolution, colormaps.rover_place(grid)), rr.Radius.ui_points(0.6)
         lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
         points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
-        self.keep(path, content, lambda: rr.LineStrips2D(colormaps.distance_lines(*content)[0], **lines))
+        self.keep(path, content, lambda: drawn(rr.LineStrips2D, strips=colormaps.distance_lines(*content)[0], **lines))
         self.keep(
             f"{path}/distances",
             content,
-            lambda: rr.Points2D(**colormaps.distance_lines(*content)[1], show_labels=True, **points),
+            lambda: drawn(rr.Points2D, **colormaps.distance_lines(*content)[1], show_labels=True, **points),
         )
 
         ways = colormaps.way_on(grid, shape, self.ways.get(grid.frame_id, []))
         if ways:
-            self.log(
-                f"{path}/way",
-                rr.LineStrips2D(ways, colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.2), draw_order=22.0),
-            )
+            shown: dict[str, Any] = {"colors": [CAMERA_RGB], "radii": rr.Radius.ui_points(1.2), "draw_order": 22.0}
+            self.log(f"{path}/way", drawn(rr.LineStrips2D, strips=ways, **shown))
 
     def limits(self, path: str, low: float, high: float) -> tuple[float, float]:
         """The lowest and the highest value given for `path` so far, so that a scale stays."""
@@ -294,9 +315,9 @@ class Canvas:
                 continue
             if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
                 # The viewer goes on showing a cleared encoded image (rerun-io/rerun#12793), but not an empty one.
-                self.recording.log(path, kind.from_fields(clear_unset=True))
+                self.rows.add(path, fields_of(kind, clear_unset=True))
             else:
-                self.recording.log(path, rr.Clear(recursive=False))
+                self.rows.add(path, CLEARED)
         self._before, self._now = self._now, {}
 
 
@@ -310,43 +331,13 @@ def label_counts(labels: Array) -> Array:
     return np.ravel(cv2.calcHist([labels], [0], None, [256], [0, 256]))
 
 
-@lru_cache(maxsize=256)
-def _recurring(kind: Any, **fields: Any) -> tuple[rr.DescribedComponentBatch, ...]:
-    """Fields of an archetype. To make these takes longer than to log an image, so those that recur are kept."""
-    return tuple(kind.from_fields(**fields).as_component_batches())
-
-
-@cache
-def _masking(name: str, color: tuple[int, ...]) -> tuple[rr.DescribedComponentBatch, ...]:
-    """How a mask is drawn: 1 in a colour, 0 not at all."""
-    labels = [
-        rr.AnnotationInfo(id=0, label="known", color=(0, 0, 0, 0)),
-        rr.AnnotationInfo(id=1, label=name, color=color),
-    ]
-    opaque = _recurring(rr.SegmentationImage, opacity=1.0)
-    return (*opaque, *rr.AnnotationContext(labels).as_component_batches())
-
-
-@lru_cache(maxsize=256)
-def _image_format(kind: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> tuple[rr.DescribedComponentBatch, ...]:
-    batches = kind(np.zeros(shape, dtype)).as_component_batches()
-    return tuple(batch for batch in batches if batch.component_descriptor().component.endswith(":format"))
-
-
-def _content(kind: Any, field: str, content: bytes | Array) -> rr.DescribedComponentBatch:
-    """The bytes of an image as the field of an archetype, not copied."""
-    (empty,) = _recurring(kind, **{field: b""})
-    stored = pa.py_buffer(content)
-    values = pa.Array.from_buffers(pa.uint8(), stored.size, [None, stored])
-    blob = pa.ListArray.from_arrays([0, stored.size], values, type=empty.as_arrow_array().type)
-    return rr.DescribedComponentBatch(rr.components.BlobBatch(blob), empty.component_descriptor())
-
-
-@lru_cache(maxsize=256)
-def _depth_range(ends: tuple[float, float]) -> rr.DescribedComponentBatch:
-    (like,) = _recurring(rr.DepthImage, depth_range=(0.0, 1.0))
-    stored = pa.FixedSizeListArray.from_arrays(np.array(ends, np.float64), type=like.as_arrow_array().type)
-    return rr.DescribedComponentBatch(rr.components.ValueRangeBatch(stored), like.component_descriptor())
+@lru_cache(maxsize=16)
+def _lens(focal: Sides, centre: Sides, size: tuple[int, int]) -> tuple[Component, ...]:
+    lens = rr.Pinhole(
+        focal_length=focal, principal_point=centre, resolution=size, color=CAMERA_RGB,
+        camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.7,
+    )  # fmt: skip
+    return components_of(lens)
 
 
 @lru_cache(maxsize=256)
@@ -362,7 +353,7 @@ def _scale(
     return tuple(zip(names, colors, strict=True))
 
 
-def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> rr.Points2D:
+def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> Drawn:
     """The dots of a legend."""
     dots, _, rows, row_height = _places(shape, len(entries), beside)
     colors, radii = [rgb for _, rgb in entries], [5.0] * len(entries)
@@ -371,15 +362,15 @@ def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bo
         # row's dots whole.
         above = [(x, -(rows + HEADROOM) * row_height) for x, y in dots if y == dots[0][1]]
         dots, colors, radii = [*dots, *above], colors + [(0, 0, 0)] * len(above), radii + [0.0] * len(above)
-    return rr.Points2D(dots, colors=colors, radii=rr.Radius.ui_points(radii), draw_order=30.0)
+    return drawn(rr.Points2D, positions=dots, colors=colors, radii=rr.Radius.ui_points(radii), draw_order=30.0)
 
 
-def _names(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> rr.Points2D:
+def _names(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> Drawn:
     """The names of a legend. A label takes the colour of its dot, which may be as dark as the background, so labels
     have dots of their own."""
     _, pins, *_ = _places(shape, len(entries), beside)
     texts: dict[str, Any] = {"labels": [name for name, _ in entries], "show_labels": True, "draw_order": 31.0}
-    return rr.Points2D(pins, colors=[TEXT_RGB], radii=rr.Radius.ui_points(0.5), **texts)
+    return drawn(rr.Points2D, positions=pins, colors=[TEXT_RGB], radii=rr.Radius.ui_points(0.5), **texts)
 
 
 def _places(

@@ -121,6 +121,12 @@ def shrunk(image: Array, max_width: int) -> Array:
     return mean
 
 
+def whole_steps(values: Array, per_unit: float) -> Array:
+    """Values (H, W) in whole steps, uint16, at most 65535; NaN and negative values become 0."""
+    steps: Array = cv2.multiply(np.ascontiguousarray(values), per_unit, dtype=cv2.CV_16U)  # type: ignore[call-overload]
+    return steps
+
+
 def gray_difference(left: Array, right: Array, disparity: Array, max_width: int) -> Array:
     """|left(x) - right(x - d)| of the pixels that `every_nth` takes, float32, in gray levels of 8 bits; NaN = unknown.
 
@@ -152,10 +158,13 @@ def provenance(terrain: ElevationMap) -> dict[str, Array]:
     return {name: np.where(layers["frames"] > 0, layers[name], np.float32(np.nan)) for name in names}
 
 
-def every_nth_cell(terrain: ElevationMap, max_cells: int) -> ElevationMap:
-    """The terrain at every n-th row and column, with about `max_cells` known elevations at most."""
-    elevation = terrain.layers["elevation"]
-    step = math.ceil(math.sqrt(max(1.0, int(np.count_nonzero(np.isfinite(elevation))) / max_cells)))
+def cell_stride(elevation: Array, max_cells: int) -> int:
+    """The n of the n-th rows and columns that have about `max_cells` known elevations at most."""
+    return math.ceil(math.sqrt(max(1.0, int(np.count_nonzero(np.isfinite(elevation))) / max_cells)))
+
+
+def every_nth_cell(terrain: ElevationMap, step: int) -> ElevationMap:
+    """The terrain at every n-th row and column."""
     if step == 1:
         return terrain
     first, pitch = step // 2, step * terrain.resolution
@@ -175,7 +184,18 @@ def segment_edges(labels: Array) -> Array:
 
 def birds_eye(grid: Array) -> Array:
     """A grid (rows along y, columns along x, ...) as a picture: x forward is up, y left is left."""
-    return np.ascontiguousarray(grid.swapaxes(0, 1)[::-1, ::-1])
+    view: Array = cv2.flip(cv2.transpose(grid), -1)
+    return view
+
+
+def birds_eyes(grids: Sequence[Array], factors: Sequence[float]) -> tuple[Array, Array]:
+    """Grids of one shape times a factor each, as pictures (n, H, W) float32 and float16, see `birds_eye`."""
+    views = np.empty((len(grids), *grids[0].shape[::-1]), np.float32)
+    for view, grid, factor in zip(views, grids, factors, strict=True):
+        np.multiply(grid.T[::-1, ::-1], np.float32(factor), out=view)
+    rows = views.reshape(-1, views.shape[2])
+    halves: Array = cv2.multiply(rows, 1.0, dtype=cv2.CV_16F)  # type: ignore[call-overload]  # numpy is slow
+    return views, halves.reshape(views.shape)
 
 
 def distance_lines(
@@ -299,7 +319,7 @@ def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None =
     elevation = terrain.layers["elevation"]
     low, high = elevation_limits(elevation) if limits is None else limits
     known = np.flatnonzero(np.isfinite(elevation))
-    rgb = np.tile(np.array(UNKNOWN_RGB, np.uint8), (elevation.size, 1))
+    rgb = np.frombuffer(bytearray(bytes(UNKNOWN_RGB) * elevation.size), np.uint8).reshape(-1, 3)
     colors = apply_palette(elevation.ravel()[known], low, high, cv2.COLORMAP_VIRIDIS)
     flat = _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * _SUN[2]  # level ground keeps the palette's colour
     shade = _shade(elevation, known, terrain.resolution, _SUN) / flat
@@ -327,22 +347,26 @@ def surface(terrain: ElevationMap) -> tuple[Array, Array]:
 
 
 def _slopes(elevation: Array, known: Array) -> tuple[Array, Array]:
-    """Per known cell, along x and along y: the mean of the rises to its two neighbours; a missing one does not count.
+    """Per known cell, along x and along y: the mean of the rises to both neighbours, or the rise to the known one."""
+    row, col = np.divmod(known, elevation.shape[1])
+    if not len(known):
+        return np.zeros(0, elevation.dtype), np.zeros(0, elevation.dtype)
+    top, left = row[0], col.min()
+    part = elevation[top : row[-1] + 1, left : col.max() + 1]  # most cells of a map are outside
+    framed = np.full((part.shape[0] + 2, part.shape[1] + 2), np.nan, elevation.dtype)
+    framed[1:-1, 1:-1] = part
+    at = (row - top) * part.shape[1] + (col - left)
+    return _mean_rise(framed[1:-1]).take(at), _mean_rise(framed[:, 1:-1].T).T.take(at)
 
-    Most cells of a map are unknown, so the known ones are gathered first.
-    """
-    rows, cols = elevation.shape
-    framed = np.full((rows + 2, cols + 2), np.nan, elevation.dtype)
-    framed[1:-1, 1:-1] = elevation
-    framed, at = framed.ravel(), known + 2 * (known // cols) + cols + 3
-    here, means = framed[at], []
-    for step in (1, cols + 2):
-        ahead, behind = framed[at + step] - here, here - framed[at - step]
-        seen = np.isfinite(ahead), np.isfinite(behind)
-        sides = seen[0].astype(np.float32) + seen[1]
-        rises = np.where(seen[0], ahead, np.float32(0)) + np.where(seen[1], behind, np.float32(0))
-        means.append(rises / np.maximum(sides, 1.0))
-    return means[0], means[1]
+
+def _mean_rise(heights: Array) -> Array:
+    """The mean of the rises to both neighbours in a row, without the first and the last cell of each."""
+    rise = heights[:, 1:] - heights[:, :-1]
+    seen = np.isfinite(rise)
+    rise[~seen] = 0
+    sides = seen[:, 1:].astype(np.float32) + seen[:, :-1]
+    mean: Array = (rise[:, 1:] + rise[:, :-1]) / np.maximum(sides, 1.0)
+    return mean
 
 
 @cache

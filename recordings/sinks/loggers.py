@@ -14,6 +14,7 @@ from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import CAMERA_RGB, Canvas, label_counts
+from recordings.sinks.entity_rows import drawn
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -156,7 +157,7 @@ def _log_sigma(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         pixels, sigma = (
             colormaps.every_nth(layer, canvas.small_width) for layer in (disparity.pixels, disparity.sigma)
         )
-        steps = _steps(np.where(np.isnan(pixels), pixels, sigma), SIGMA_STEPS)
+        steps = colormaps.whole_steps(np.where(np.isnan(pixels), pixels, sigma), SIGMA_STEPS)
         view = ViewSpec(Panel.SIGMA, stream, "sigma", f"{stream}: sigma")
         canvas.log_steps(steps, SIGMA_STEPS, MAX_SIGMA, view, "px")
 
@@ -167,13 +168,7 @@ def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         shifted = colormaps.every_nth(disparity.pixels, canvas.small_width) + np.float32(camera.cx_right - camera.cx)
         depth = camera.fx * camera.baseline / np.where(shifted > 0, shifted, np.float32(np.nan))
         view = ViewSpec(Panel.DEPTH, stream, "depth", f"{stream}: depth")
-        canvas.log_steps(_steps(depth, DEPTH_STEPS), DEPTH_STEPS, MAX_DEPTH, view, "m")
-
-
-def _steps(values: Array, per_unit: float) -> Array:
-    """Values (H, W) in whole steps, uint16, at most 65535; NaN and negative values become 0."""
-    steps: Array = cv2.multiply(np.ascontiguousarray(values), per_unit, dtype=cv2.CV_16U)  # type: ignore[call-overload]
-    return steps
+        canvas.log_steps(colormaps.whole_steps(depth, DEPTH_STEPS), DEPTH_STEPS, MAX_DEPTH, view, "m")
 
 
 def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int, filled: Array | None) -> None:
@@ -181,7 +176,7 @@ def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int, fill
     thinned = colormaps.every_nth(pixels, max_width)
     _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(thinned))
     view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)
-    steps = _steps(thinned, DISPARITY_STEPS)
+    steps = colormaps.whole_steps(thinned, DISPARITY_STEPS)
     canvas.log_steps(steps, DISPARITY_STEPS, limit, view, "px", veiled=("filled", filled))
 
 
@@ -192,7 +187,7 @@ def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
         if canvas.pictures:
             some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
             places = np.rint(POINT_STEPS * cloud.points[some]) / np.float32(POINT_STEPS)
-            points = rr.Points3D(places, colors=cloud.colors[some], radii=rr.Radius.ui_points(2.0))
+            points = drawn(rr.Points3D, positions=places, colors=cloud.colors[some], radii=rr.Radius.ui_points(2.0))
             view = ViewSpec(Panel.CLOUD, stream, "points", stream, cloud.frame_id)
             canvas.log(view.path, points, view)
         # An optical axis (z) below the horizon is pitch down; the image's right side (x) below it is roll right.
@@ -209,9 +204,9 @@ def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
         return caption
     some = slice(None, None, max(1, -(-len(voxels.index) // canvas.max_points)))
     centres = (voxels.index[some] + np.float32(0.5)) * np.float32(voxels.resolution)
-    half = np.full((1, 3), voxels.resolution / 2, np.float32)
-    boxes = rr.Boxes3D(centers=centres, half_sizes=np.broadcast_to(half, centres.shape), colors=voxels.colors[some],
-                       fill_mode=rr.components.FillMode.Solid)  # fmt: skip
+    half_sizes = np.full_like(centres, voxels.resolution / 2)
+    boxes = drawn(rr.Boxes3D, centers=centres, half_sizes=half_sizes, colors=voxels.colors[some],
+                  fill_mode=rr.components.FillMode.Solid)  # fmt: skip
     view = ViewSpec(Panel.VOXELS, stream, "voxels", stream, voxels.frame_id)
     canvas.log(view.path, boxes, view)
     return caption
@@ -228,7 +223,7 @@ def log_tilt(canvas: Canvas, stream: str, tilt: Tilt) -> None:
 def log_pose(canvas: Canvas, stream: str, pose: Pose) -> None:
     """An arrow along the rover's heading; the viewer shows those of all frames so far."""
     forward = matrix_of(pose.quaternion) @ [0.4, 0.0, 0.0]
-    arrow = rr.Arrows3D(origins=[pose.position], vectors=[forward], colors=[CAMERA_RGB])
+    arrow = drawn(rr.Arrows3D, origins=[pose.position], vectors=[forward], colors=[CAMERA_RGB])
     view = ViewSpec(Panel.TRAJECTORY, stream, "trajectory", f"{stream} ({pose.frame_id})", pose.frame_id)
     canvas.log(view.path, arrow, view)
     canvas.ways.setdefault(pose.frame_id, []).append((float(pose.position[0]), float(pose.position[1])))
@@ -276,28 +271,36 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     caption = f"{stream} {counted(int(np.count_nonzero(np.isfinite(elevation))), 'cell')}"
     if not canvas.pictures:
         return caption
-    coarse = colormaps.every_nth_cell(terrain, MAX_CELLS)
-    layers = coarse.layers if terrain.frame_id == LEVEL_FRAME else colormaps.provenance(coarse)
-    for name, layer in layers.items():
-        part = f"layers/{rr.escape_entity_path_part(name)}"
-        view = ViewSpec(Panel.LAYER, stream, part, f"{name}{suffix}", terrain.frame_id)
-        picture = colormaps.birds_eye(layer)
-        end, unit = LAYER_SCALES.get(name, (0.0, ""))
-        scale = float(np.degrees(1.0)) if unit == "deg" else 1.0
-        values: Array = cv2.multiply(picture, scale, dtype=cv2.CV_16F)  # type: ignore[call-overload]
+    step = colormaps.cell_stride(elevation, MAX_CELLS)
+    coarse = colormaps.every_nth_cell(terrain, step)
+    _log_layers(canvas, stream, coarse, (low, high))
+    vertices, triangles = colormaps.surface(coarse)
+    if len(triangles):
+        colors = rgb[step // 2 :: step, step // 2 :: step][np.isfinite(coarse.layers["elevation"])]
+        mesh = drawn(rr.Mesh3D, vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colors)
+        view = ViewSpec(Panel.TERRAIN, stream, "surface", stream, terrain.frame_id)
+        canvas.log(view.path, mesh, view)
+    return caption
+
+
+def _log_layers(canvas: Canvas, stream: str, terrain: ElevationMap, heights: tuple[float, float]) -> None:
+    """The layers of a terrain. heights: the ends of the scale of elevations, m."""
+    layers = terrain.layers if terrain.frame_id == LEVEL_FRAME else colormaps.provenance(terrain)
+    if not layers:
+        return
+    scales, suffix = [LAYER_SCALES.get(name, (0.0, "")) for name in layers], _frame_suffix(terrain.frame_id)
+    factors = [float(np.degrees(1.0)) if unit == "deg" else 1.0 for _, unit in scales]
+    pictures = zip(*colormaps.birds_eyes([*layers.values()], factors), strict=True)
+    for name, (end, unit), (picture, values) in zip(layers, scales, pictures, strict=True):
+        view = ViewSpec(
+            Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", name + suffix, terrain.frame_id
+        )
         if name == "elevation":
-            canvas.log_values(values, (low, high), view, "m", cv2.COLORMAP_VIRIDIS)
+            canvas.log_values(values, heights, view, "m", cv2.COLORMAP_VIRIDIS)
         elif unit:
             canvas.log_values(values, (0.0, end), view, unit, hazard=canvas.hazard_limits.get(f"{stream}/{name}"))
         else:
             canvas.log_values(values, colormaps.value_limits(picture), view)
-    vertices, triangles = colormaps.surface(coarse)
-    if len(triangles):
-        colors = colormaps.elevation_colors(coarse, (low, high))[np.isfinite(coarse.layers["elevation"])]
-        mesh = rr.Mesh3D(vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colors)
-        view = ViewSpec(Panel.TERRAIN, stream, "surface", stream, terrain.frame_id)
-        canvas.log(view.path, mesh, view)
-    return caption
 
 
 @logger_for(NavigationMap)
@@ -333,18 +336,12 @@ def log_camera(canvas: Canvas, stream: str, frame: StereoFrame, cloud: PointClou
         return
     left, scale = colormaps.top_eight_bits(frame.left, frame.right)[0], THUMBNAIL_SCALE
     small = cv2.resize(left, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    height, width = small.shape[:2]
     view = ViewSpec(Panel.CAMERA, stream, "camera", stream, cloud.frame_id)
     canvas.log_image(f"{view.path}/image", small, view)
-    pinhole = rr.Pinhole(
-        focal_length=(camera.fx * scale, camera.fy * scale), width=width, height=height, color=CAMERA_RGB,
-        principal_point=((camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5),
-        camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.7,
-    )  # fmt: skip
-    # Logged past the canvas: a frame without a camera clears the image, and the empty frustum may stay.
-    canvas.recording.log(view.path, rr.Transform3D(translation=sensor.translation, mat3x3=sensor.rotation), pinhole)
+    centre = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
+    canvas.place_camera(view.path, sensor, (camera.fx * scale, camera.fy * scale), centre, small.shape[1::-1])
     plumb = [sensor.translation, sensor.translation * (1.0, 1.0, 0.0)]
-    strip = rr.LineStrips3D([plumb], colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.0))
+    strip = drawn(rr.LineStrips3D, strips=[plumb], colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.0))
     canvas.log(f"{stream}/plumb", strip, ViewSpec(Panel.CAMERA, stream, "plumb", stream, cloud.frame_id))
 
 
@@ -354,7 +351,7 @@ def log_hazards(canvas: Canvas, stream: str, navigation: NavigationMap, terrain:
     centres = _hazards(navigation, terrain)
     if len(centres):
         raised, red = centres + np.array([0.0, 0.0, HAZARD_LIFT]), [colormaps.CELL_LEGEND[Cell.HAZARD][1]]
-        hazards = rr.Points3D(raised, colors=red, radii=0.4 * terrain.resolution)
+        hazards = drawn(rr.Points3D, positions=raised, colors=red, radii=0.4 * terrain.resolution)
         canvas.log(f"{stream}/hazards", hazards, ViewSpec(Panel.TERRAIN, stream, "hazards", stream, terrain.frame_id))
 
 
@@ -376,7 +373,8 @@ def log_hazards_in_view(
     radii = np.maximum(1.0, 0.4 * terrain.resolution * camera.fx * scale / seen[inside, 2])
     whole = np.clip(pixels[inside], radii[:, None], size - radii[:, None])  # a dot over the edge would move the image
     colors = [(*colormaps.CELL_LEGEND[Cell.HAZARD][1], 150)]
-    canvas.log(f"{stream}/left/hazards", rr.Points2D(whole, colors=colors, radii=radii, draw_order=20.0))
+    dots = drawn(rr.Points2D, positions=whole, colors=colors, radii=radii, draw_order=20.0)
+    canvas.log(f"{stream}/left/hazards", dots)
 
 
 def _hazards(navigation: NavigationMap, terrain: ElevationMap) -> Array:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,6 +36,7 @@ from recordings.sinks.blueprint import (
     ViewSpec,
 )  # fmt: skip
 from recordings.sinks.canvas import CURVE_RGB, Canvas, lines_of
+from recordings.sinks.entity_rows import BATCH_BYTES, clocks_of
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
@@ -45,7 +46,6 @@ from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
 PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers and lines are sent at once, without and with a viewer
-BATCH_BYTES = 1 << 19  # that one entity waits with; each stored chunk takes 3 kB besides its content
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
@@ -77,6 +77,8 @@ class RerunRecording:
         self._frames, self._views = 0, -1
         self._notes: list[_Note] = []  # of frames, not sent yet
         self._work = Counter[str]()  # stage -> seconds of all frames
+        self._loggers: dict[type, list[Callable[..., str | None]]] = {}  # by the type of an item
+        self._plotted: dict[tuple[str, str], str] = {}  # root and stage -> path of its times or queue
         with writing(self._path):
             self._partial.open("wb").close()
         try:
@@ -125,6 +127,7 @@ class RerunRecording:
         self._check_room()
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
+            self._canvas.rows.stamp, self._canvas.rows.frame = record.stamp, self._frames
             self._choose_pictures(record.items)
             for stream in record.unchanged:
                 self._canvas.keep_all(stream)
@@ -134,6 +137,7 @@ class RerunRecording:
             self._log_losses(record.entries, self._frames)
             self._send_blueprint()
             if self._viewer is not None:
+                self._canvas.rows.send()
                 self._recording.flush()  # a viewer shows each frame at once
                 self._viewer.grown()
         self._frames += 1
@@ -163,6 +167,7 @@ class RerunRecording:
 
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Log the verdict, the remaining losses and the findings."""
+        self._canvas.rows.send()
         self._send_notes()
         verdict = str(summary.get("verdict", "INCOMPLETE"))
         last = max(0, self._frames - 1)
@@ -228,8 +233,10 @@ class RerunRecording:
         for stream, item in present.items():
             if _drawn_later(stream, present):
                 continue
-            loggers = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and isinstance(item, kinds[0])]
-            texts = [log(self._canvas, stream, item) for log in loggers or [log_own]]
+            if (kind := type(item)) not in self._loggers:
+                fitting = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and issubclass(kind, kinds[0])]
+                self._loggers[kind] = fitting or [log_own]
+            texts = [log(self._canvas, stream, item) for log in self._loggers[kind]]
             captions += texts if "/" not in stream else []
         for kinds, log in LOGGERS.items():
             if len(kinds) > 1:
@@ -244,11 +251,13 @@ class RerunRecording:
         self._work.update(record.seconds)
         for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
             for stage, number in numbers.items():
-                view = ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
-                values[view.path] = float(number)
-                if root == QUEUES and (Panel.STAGE, view.path) not in self._canvas.views:
-                    self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
-                self._canvas.add_view(view)
+                if (root, stage) not in self._plotted:
+                    view = ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
+                    self._plotted[root, stage] = view.path
+                    self._canvas.add_view(view)
+                    if root == QUEUES:
+                        self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
+                values[self._plotted[root, stage]] = float(number)
         self._notes.append(_Note(record.stamp, self._frames, values, lines_of(text)))
         if len(self._notes) >= (PLOT_BATCH if self._viewer is None else LIVE_BATCH):
             self._send_notes()
@@ -268,7 +277,7 @@ class RerunRecording:
             self._send(FRAMES, [note for note, _ in lines], columns)
 
     def _send(self, path: str, notes: Sequence[_Note], columns: rr.ComponentColumnList) -> None:
-        clocks = _clocks([note.stamp for note in notes], [note.frame for note in notes])
+        clocks = clocks_of([note.stamp for note in notes], [note.frame for note in notes])
         self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
 
     def _log_losses(self, entries: Iterable[Loss], frame: int) -> None:
@@ -282,7 +291,7 @@ class RerunRecording:
             for line in lines_of(f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}")
         ]
         stamps, texts = zip(*rows, strict=True)
-        clocks = _clocks(stamps, [frame] * len(rows))
+        clocks = clocks_of(stamps, [frame] * len(rows))
         columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(rows))
         self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
         self._stamp = max(losses[-1].stamp, self._stamp)
@@ -308,18 +317,13 @@ def _is(kind: Any, wanted: type) -> bool:
     return isinstance(plain, type) and issubclass(plain, wanted)
 
 
-def _clocks(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:
-    """The recording's two timelines at these stamps, ns, and frames."""
-    times = np.array(stamps, "datetime64[ns]")
-    return [rr.TimeColumn(CLOCK, timestamp=times), rr.TimeColumn(FRAME, sequence=frames)]
-
-
 def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
     """The streams for a logger of several types: the last of each type, for every frame of reference.
 
     A type without a frame of reference goes with every frame. Of stereo frames the last one of the camera's size goes.
     """
-    frames = {getattr(item, "frame_id", None): None for item in items.values() if isinstance(item, kinds)}
+    items = {stream: item for stream, item in items.items() if isinstance(item, kinds)}
+    frames = {getattr(item, "frame_id", None): None for item in items.values()}
     for frame in [frame for frame in frames if frame is not None] or [None]:
         fitting = {stream: item for stream, item in items.items() if getattr(item, "frame_id", frame) == frame}
         chosen = [_last_of(kind, fitting) for kind in kinds]
@@ -341,17 +345,18 @@ def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
     That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights
     and more layers; the very same pose.
     """
-    mine, later = items[stream], islice(items.values(), list(items).index(stream) + 1, None)
+    mine = items[stream]
+    if not isinstance(mine, Pose | StereoFrame | ElevationMap):
+        return False
+    later = islice(items.values(), list(items).index(stream) + 1, None)
     if isinstance(mine, Pose):
         return any(item is mine for item in later)
     if isinstance(mine, StereoFrame):
         frames = (item for item in later if isinstance(item, StereoFrame))
         return any(_same(item.left, mine.left) and _same(item.right, mine.right) for item in frames)
-    if isinstance(mine, ElevationMap):
-        maps = (item.layers for item in later if isinstance(item, ElevationMap))
-        return any(mine.layers.keys() <= layers.keys() and _same(layers["elevation"], mine.layers["elevation"])
-                   for layers in maps)  # fmt: skip
-    return False
+    maps = (item.layers for item in later if isinstance(item, ElevationMap))
+    return any(mine.layers.keys() <= layers.keys() and _same(layers["elevation"], mine.layers["elevation"])
+               for layers in maps)  # fmt: skip
 
 
 def _same(one: Array, other: Array) -> bool:

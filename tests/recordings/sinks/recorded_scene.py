@@ -113,7 +113,7 @@ TIMED = (SECONDS, QUEUES, FRAMES, SUMMARY, LAYOUT, "__properties")  # what depen
 
 
 def rows(path: Path, entity: str, component: str) -> list[tuple[int | None, int | None, Any]]:
-    """(log clock ns, frame, value) of every row of an entity's component, in time order; a cleared row is None."""
+    """(log clock ns, frame, value) of every row with an entity's component, in time order; [] where it is cleared."""
     found = []
     for chunk in rr.chunk.RrdReader(str(path)).stream():
         if chunk.entity_path != entity:
@@ -127,6 +127,7 @@ def rows(path: Path, entity: str, component: str) -> list[tuple[int | None, int 
             for name in (CLOCK, FRAME)
         ]
         found += list(zip(*clocks, batch.column(component).to_pylist(), strict=True))
+    found = [row for row in found if row[2] is not None]
     return sorted(found, key=lambda row: (row[0] or 0, row[1] or 0))
 
 
@@ -139,7 +140,8 @@ def pictures(path: Path) -> dict[tuple[str, str], list[Any]]:
             names = [name for name in batch.schema.names if ":" in name]
             for name in names:
                 times = batch.column(CLOCK).to_pylist() if CLOCK in batch.schema.names else [None] * len(batch)
-                found.setdefault((chunk.entity_path, name), []).extend(zip(times, batch.column(name), strict=True))
+                values = [row for row in zip(times, batch.column(name), strict=True) if row[1].is_valid]
+                found.setdefault((chunk.entity_path, name), []).extend(values)
     return {key: sorted(rows, key=lambda row: (row[0] is not None, row[0])) for key, rows in found.items()}
 
 
