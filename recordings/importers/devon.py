@@ -19,7 +19,6 @@ from recordings.importers.pairing import pair_images
 from recordings.importers.recording import (
     BASE,
     IMU,
-    LEFT,
     ImagePair,
     ImportedRecording,
     Logged,
@@ -32,12 +31,12 @@ from recordings.importers.track import upright
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import up_of
 from recordings.ros2.to_msg import header, imu
-from stages.data import StereoCamera, Transform
+from stages.data import Transform
 
-# Width of the images -> f, cx, cy, px, of the two rectified sets.
+# Width of the images -> f and (cx, cy), px, of the two rectified sets.
 LENSES = {
-    1280: (968.999694824, 635.139038086, 463.537109375),
-    512: (387.599884033, 253.755615234, 185.114852905),
+    1280: (968.999694824, (635.139038086, 463.537109375)),
+    512: (387.599884033, (253.755615234, 185.114852905)),
 }
 BASELINE = 0.239977002
 TIMES = "image-times.txt"
@@ -59,13 +58,11 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
     width, height = common_size(pairs)
     if width not in LENSES:
         rig.need(f"a set with images of {width}x{height}", *LENS)
-    focal, cx, cy = LENSES.get(width, (1.0, 0.0, 0.0))
-    camera = rig.camera(
-        StereoCamera(fx=focal, fy=focal, cx=cx, cy=cy, baseline=BASELINE, width=width, height=height, frame_id=LEFT)
-    )
-    mounts = [rig.mount, beside(camera), Transform(BASE, IMU, np.eye(3), np.zeros(3))]
+    focal, centre = LENSES.get(width, (1.0, (0.0, 0.0)))
+    camera = rig.camera((width, height), focal, BASELINE, centre)
     return ImportedRecording(
-        rectified_models(camera), True, pairs, [mount for mount in mounts if mount is not None],
+        rectified_models(camera), True, pairs,
+        [rig.mount, beside(camera), Transform(BASE, IMU, np.eye(3), np.zeros(3))],
         [_tilts(folder, rig, stamps), _positions(folder / "gps-topocentric.txt", stamps)], notes=notes,
     )  # fmt: skip
 

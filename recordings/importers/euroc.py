@@ -57,12 +57,12 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
     if calibrated.camera_from_imu is None or calibrated.right_in_left is None:
         raise LogError(f"{calibration[0]} lacks the transform between Imu and camera; give the file of imu and cameras")
     camera_from_imu = calibrated.camera_from_imu @ _imu_in_body(folder / "imu0" / "sensor.yaml")
-    mounts = [rigid(LEFT, RIGHT, calibrated.right_in_left), rigid(LEFT, IMU, camera_from_imu)]
+    mounts = [rig.mount, rigid(LEFT, RIGHT, calibrated.right_in_left), rigid(LEFT, IMU, camera_from_imu)]
     pairs = _pairs(folder, left, right, notes)
     truth = next((path for name in TRUTHS if (path := folder / name / "data.csv").exists()), None)
     return ImportedRecording(
         raw_models(calibrated, common_size(pairs)), False, pairs,
-        [*filter(None, [rig.mount]), *mounts], [_imu(folder / "imu0" / "data.csv")],
+        mounts, [_imu(folder / "imu0" / "data.csv")],
         None if truth is None else _track(truth), true_tilt=True, notes=notes,
     )  # fmt: skip
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from recordings.errors import LogError
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.image_from_msg import stated_size, unpacked_pixels
-from stages.data import Array
+from stages.data import Array, StereoCamera
 
 ENCODED = {b"\x89PNG": "png", b"\xff\xd8\xff": "jpeg"}  # first bytes of the files that a log contains unchanged
 MAX_ROUNDING = 0.01  # of the length of a quaternion
@@ -109,14 +109,11 @@ def from_date(text: str, where: str) -> int:
         if found is None:
             raise ValueError
         *parts, fraction, zone = found.groups()
-        moment = datetime(*map(int, parts), tzinfo=UTC)  # type: ignore[arg-type, misc]
+        offset = datetime.strptime(zone or "Z", "%z").tzinfo
+        moment = datetime(*map(int, parts), tzinfo=offset)  # type: ignore[arg-type, misc]
     except ValueError as error:
         raise LogError(f"{where} has the time '{text}', which is no date with time; get the file again") from error
-    seconds = int(moment.timestamp())
-    if zone and zone != "Z":
-        hours, minutes = int(zone[1:3]), int(zone[-2:])
-        seconds -= (1 if zone[0] == "+" else -1) * (3600 * hours + 60 * minutes)
-    return _checked(seconds * 1_000_000_000 + int((fraction or "0").ljust(9, "0")), text, where)
+    return _checked(int(moment.timestamp()) * 1_000_000_000 + int((fraction or "0").ljust(9, "0")), text, where)
 
 
 def _checked(stamp: int, text: str, where: str) -> int:
@@ -146,3 +143,11 @@ def read_pixels(path: Path) -> Array:
     if pixels is None:
         raise LogError(f"{path} is not a readable image of 8 or 16 bit")
     return pixels
+
+
+def of_size(truth: Array, camera: StereoCamera, path: Path) -> Array:
+    """The truth of a file, if it has the size of the images. Raises LogError."""
+    if truth.shape != (camera.height, camera.width):
+        size = f"{truth.shape[1]}x{truth.shape[0]}"
+        raise LogError(f"{path} is {size}, but the images are {camera.width}x{camera.height}; use files of one size")
+    return truth

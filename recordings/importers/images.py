@@ -158,7 +158,7 @@ def standing(
     offset = min([TILT_OFFSET_NS, *(np.diff(stamps) // 4).tolist()])
     level, sensors = Transform(BASE, IMU, np.eye(3), np.zeros(3)), [_level_tilts(stamps, offset)]
     if moving is None:
-        return ImportedRecording(cameras, True, pairs, [*filter(None, [rig.mount]), right, level], sensors)
+        return ImportedRecording(cameras, True, pairs, [rig.mount, right, level], sensors)
     turns = ((stamp, "/tf", transform_message([(mount, stamp)])) for stamp, mount in zip(stamps, moving, strict=True))
     return ImportedRecording(cameras, True, pairs, [right, level], [*sensors, turns])
 

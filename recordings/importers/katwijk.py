@@ -70,7 +70,7 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
     if calibrated.right_in_left is not None:  # else the projections contain the baseline
         mounts.append(rigid(LEFT, RIGHT, calibrated.right_in_left))
     return ImportedRecording(
-        raw_models(calibrated, size), False, pairs, [mount for mount in mounts if mount is not None],
+        raw_models(calibrated, size), False, pairs, mounts,
         [_sensors(source / "imu.txt"), _places(source / "gps-utm31.txt", notes)], notes=notes,
     )  # fmt: skip
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.importers.files import from_date, numbers_of, read_lines
-from recordings.importers.kitti_odometry import read_odometry, stereo_camera
+from recordings.importers.kitti_odometry import existing, read_odometry, stereo_camera
 from recordings.importers.recording import (
     BASE,
     IMU,
@@ -57,7 +56,12 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     home = source if (source / CALIBRATIONS[0]).exists() else source.resolve().parent
     cameras, velo_to_cam, imu_to_velo = (_calibration(home / name) for name in CALIBRATIONS)
     notes: list[str] = []
-    pairs = _pairs(source, left, right, notes)
+    folders = [source / f"image_{camera}" / "data" for camera in (left, right)]
+    listed = [
+        ImagePair(from_date(line, where), folders[0] / f"{number:010d}.png", folders[1] / f"{number:010d}.png")
+        for number, (where, line) in enumerate(read_lines(source / f"image_{left}" / "timestamps.txt"))
+    ]
+    pairs = sorted(existing(listed, "timestamps.txt", notes), key=lambda pair: pair.stamp)
     camera_from_imu = _rigid(velo_to_cam, "R", "T") @ _rigid(imu_to_velo, "R", "T")
     size = common_size(pairs)
     rectified = size == tuple(_entry(cameras, f"S_rect_{left}", 2).astype(int))
@@ -72,19 +76,6 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     track = _track(stamps, table, source / "oxts")
     mounts, sensors = [base, right_in_left, to_imu], [_tilts(track), _fixes(stamps, table)]
     return ImportedRecording(models, rectified, pairs, mounts, sensors, track, notes=notes)
-
-
-def _pairs(source: Path, left: str, right: str, notes: list[str]) -> list[ImagePair]:
-    """The pairs of which both images exist; a note about the others."""
-    pairs = []
-    stamps = [from_date(line, where) for where, line in read_lines(source / f"image_{left}" / "timestamps.txt")]
-    for number, stamp in enumerate(stamps):
-        files = [source / f"image_{camera}" / "data" / f"{number:010d}.png" for camera in (left, right)]
-        if all(file.exists() for file in files):
-            pairs.append(ImagePair(stamp, *files))
-    if len(pairs) < len(stamps):
-        notes.append(f"timestamps.txt lists {counted(len(stamps) - len(pairs), 'pair')} without one of the images")
-    return sorted(pairs, key=lambda pair: pair.stamp)
 
 
 def _calibration(path: Path) -> dict[str, Array]:

@@ -45,11 +45,9 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
         ImagePair(stamp, folders[0] / f"{number:06d}.png", folders[1] / f"{number:06d}.png")
         for number, stamp in enumerate(stamps)
     ]
-    pairs = [pair for pair in listed if pair.left.exists() and pair.right.exists()]
     notes: list[str] = []
     tilts: Iterable[Logged]
-    if len(pairs) < len(stamps):
-        notes.append(f"times.txt lists {counted(len(stamps) - len(pairs), 'pair')} without one of the images")
+    pairs = existing(listed, "times.txt", notes)
     if not pairs:
         raise LogError(f"{source} contains no pair of images in image_{cameras[0]} and image_{cameras[1]}")
     projections = [_projections(source / "calib.txt")[camera] for camera in cameras]
@@ -69,6 +67,14 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     return ImportedRecording(
         rectified_models(camera), True, pairs, [mount, beside(camera)], [tilts], track, notes=notes
     )  # fmt: skip
+
+
+def existing(listed: list[ImagePair], file: str, notes: list[str]) -> list[ImagePair]:
+    """The pairs of which both images exist; a note about the others, which `file` lists."""
+    pairs = [pair for pair in listed if pair.left.exists() and pair.right.exists()]
+    if len(pairs) < len(listed):
+        notes.append(f"{file} lists {counted(len(listed) - len(pairs), 'pair')} without one of the images")
+    return pairs
 
 
 def stereo_camera(projections: list[Array], size: tuple[int, int]) -> tuple[StereoCamera, Array]:

@@ -16,7 +16,6 @@ from recordings.errors import LogError
 from recordings.importers.files import nanoseconds, numbers_of, read_lines, rotation_of
 from recordings.importers.recording import (
     BASE,
-    LEFT,
     ImagePair,
     ImportedRecording,
     beside,
@@ -26,7 +25,6 @@ from recordings.importers.recording import (
 )
 from recordings.importers.rig import AXES, Rig
 from recordings.importers.track import Track
-from stages.data import StereoCamera
 
 WIDTH, FOCAL, BASELINE = 1024, 610.17784, 0.310  # px, px, m
 POSES = "Rover_pose.txt"
@@ -49,14 +47,10 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     if not pairs:
         raise LogError(f"{source} contains no pair of images in image1/RGB and image2/RGB")
     pairs.sort(key=lambda pair: pair.stamp)
-    width, height = common_size(pairs)
-    focal = FOCAL * width / WIDTH
-    usual = StereoCamera(
-        fx=focal, fy=focal, cx=width / 2, cy=height / 2, baseline=BASELINE, width=width, height=height, frame_id=LEFT
-    )
-    camera, track = rig.camera(usual), _track(source / POSES, rig)
+    size, track = common_size(pairs), _track(source / POSES, rig)
+    camera = rig.camera(size, FOCAL * size[0] / WIDTH, BASELINE)
     return ImportedRecording(
-        rectified_models(camera), True, pairs, [*filter(None, [rig.mount]), beside(camera)],
+        rectified_models(camera), True, pairs, [rig.mount, beside(camera)],
         [tilts_of(track, track.stamps.tolist())], track, notes=notes,
     )  # fmt: skip
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.importers.files import read_bytes, read_lines
+from recordings.importers.files import of_size, read_bytes, read_lines
 from recordings.importers.images import read_frame, standing
 from recordings.importers.recording import (
     FIRST_STAMP,
@@ -113,9 +113,9 @@ def read_scene(folder: Path | str, stamp: int = FIRST_STAMP) -> MiddleburyScene:
     left, right = (folder / name for name in IMAGES)
     frame = read_frame(stamp, (left, right), numbers)
     path = next((folder / name for name in TRUTHS if (folder / name).exists()), None)
-    truth = _same_size(read_pfm(path), frame, path) if path is not None else None
+    truth = of_size(read_pfm(path), frame.camera, path) if path is not None else None
     mask = folder / MASK
-    occlusion = _same_size(_codes(mask), frame, mask) if truth is not None and mask.exists() else None
+    occlusion = of_size(_codes(mask), frame.camera, mask) if truth is not None and mask.exists() else None
     return MiddleburyScene(folder.resolve().name, frame, ndisp, truth, occlusion, text)
 
 
@@ -182,15 +182,6 @@ def _codes(path: Path) -> Array:
     if invalid := np.setdiff1d(mask, (SEEN_BY_BOTH, SEEN_BY_ONE, SEEN_BY_NONE)).tolist():
         raise LogError(f"{path} has a pixel of {invalid[0]}; an occlusion mask has only 255, 128 and 0")
     return np.asarray(mask)
-
-
-def _same_size(truth: Array, frame: StereoFrame, path: Path) -> Array:
-    """Return `truth` if it has the size of the images."""
-    height, width = frame.left.shape[:2]
-    if truth.shape != (height, width):
-        size = f"{truth.shape[1]}x{truth.shape[0]}"
-        raise LogError(f"{path} is {size}, but the images are {width}x{height}; use files of one size")
-    return truth
 
 
 def _truth(scene: MiddleburyScene) -> Iterator[Logged]:

@@ -55,15 +55,16 @@ class ImportedRecording:
     """What a data set contains.
 
     cameras: left and right; rectified: whether the images are; pairs: in the order of stamps; mounts: static
-    transforms; sensors: streams of (stamp, topic, message), each in the order of stamps; truth: the exact poses, of
-    which those at the frames are written; true_tilt: whether they are better than the sensors' tilt; more: further
-    messages of a frame; metadata: name and content of a record; notes: what a user should know.
+    transforms, None for an unknown one; sensors: streams of (stamp, topic, message), each in the order of stamps;
+    truth: the exact poses, of which those at the frames are written; true_tilt: whether they are better than the
+    sensors' tilt; more: further messages of a frame; metadata: name and content of a record; notes: what a user should
+    know.
     """
 
     cameras: tuple[CameraModel, CameraModel]
     rectified: bool
     pairs: Sequence[ImagePair]
-    mounts: Sequence[Transform]
+    mounts: Sequence[Transform | None]
     sensors: Sequence[Iterable[Logged]] = ()
     truth: Track | None = None
     true_tilt: bool = False
@@ -84,8 +85,8 @@ def write_recording(
     with a file that is no whole image of the calibration's size, or with the time of the pair before it, is left out
     with a note. Raises LogError if no log can be made.
     """
-    tree = TransformTree()
-    for mount in recording.mounts:
+    tree, mounts = TransformTree(), [mount for mount in recording.mounts if mount is not None]
+    for mount in mounts:
         tree.join(mount)
     topics = [f"/stereo/{side}/{'image_rect' if recording.rectified else 'image_raw'}" for side in SIDES]
     cameras = calibrated_pair(recording.cameras, (LEFT, RIGHT), (topics[0], topics[1]), tree)
@@ -104,7 +105,7 @@ def write_recording(
         frames = _frames(recording, cameras[0], tree, topics, writer, unreadable, progress)
         events = merge(*recording.sensors, frames, key=itemgetter(0))
         start = next(events)
-        writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in recording.mounts), start[0])
+        writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in mounts), start[0])
         for stamp, topic, message in chain([start], events):
             if not isinstance(message, partial):
                 writer.write(topic, message, stamp)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -92,11 +92,18 @@ class Rig(Checked):
             )
         return np.array(_UPRIGHT[self.world_up or "z"], np.float64), turn
 
-    def camera(self, usual: StereoCamera) -> StereoCamera:
-        """The rectified camera: the usual one of the data set with the entries of the file."""
-        given = {name: getattr(self, name) for name in LENS}
-        values = {name: value for name, value in given.items() if value is not None}
-        return replace(usual, **values, **{to: values[of] for of, to in _SAME.items() if of in values})
+    def camera(
+        self, size: tuple[int, int], focal: float, baseline: float, centre: tuple[float, float] | None = None
+    ) -> StereoCamera:
+        """The rectified camera by the entries of the file, else by these of the data set.
+
+        centre: the principal point, px; None: the middle of the image.
+        """
+        width, height = size
+        cx, cy = centre or (width / 2, height / 2)
+        lens: dict[str, Any] = {"fx": focal, "cx": cx, "cy": cy, "baseline": baseline}
+        lens |= {name: value for name in LENS if (value := getattr(self, name)) is not None}
+        return StereoCamera(**lens, fy=lens["fx"], width=width, height=height, frame_id=LEFT)
 
 
 _AXES = {"f": (1, 0, 0), "b": (-1, 0, 0), "l": (0, 1, 0), "r": (0, -1, 0), "u": (0, 0, 1), "d": (0, 0, -1)}
@@ -104,7 +111,6 @@ _UPRIGHT = {
     "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)), "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
     "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)), "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
 }  # fmt: skip
-_SAME = {"fx": "fy", "cx": "cx_right"}
 
 
 def read_rig(path: Path | None, entries: Collection[str]) -> Rig:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import numbers_of, read_bytes, read_rows, rotation_of
+from recordings.importers.files import numbers_of, of_size, read_bytes, read_rows, rotation_of
 from recordings.importers.recording import (
     FIRST_STAMP,
     LEFT,
@@ -61,15 +61,12 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
         notes.append(f"{counted(alone, 'image')} of image_{left} without a partner in image_{right}")
     if not found:
         raise LogError(f"{source} contains no pair of images in image_{left} and image_{right}")
-    width, height = common_size(list(found.values()))
-    usual = StereoCamera(
-        fx=width / 2, fy=width / 2, cx=width / 2, cy=height / 2, baseline=BASELINE, width=width, height=height,
-        frame_id=LEFT,
-    )  # fmt: skip
-    camera, track, pairs = rig.camera(usual), _track(source / f"pose_{left}.txt"), list(found.values())
+    pairs, track = list(found.values()), _track(source / f"pose_{left}.txt")
+    size = common_size(pairs)
+    camera = rig.camera(size, size[0] / 2, BASELINE)
     depths = [next(iter(source.glob(f"depth_{left}/{pair.left.stem}_depth.*")), None) for pair in pairs]
     return ImportedRecording(
-        rectified_models(camera), True, pairs, [*filter(None, [rig.mount]), beside(camera)],
+        rectified_models(camera), True, pairs, [rig.mount, beside(camera)],
         [tilts_of(track, [pair.stamp for pair in pairs])], track, notes=notes,
         more=lambda number: _truth(pairs[number].stamp, camera, depths[number]),
     )  # fmt: skip
@@ -89,11 +86,7 @@ def _truth(stamp: int, camera: StereoCamera, path: Path | None) -> Iterator[Logg
     """The true disparity by a depth image."""
     if path is None:
         return
-    depth = _depth(path)
-    if depth.shape != (camera.height, camera.width):
-        raise LogError(
-            f"{path} is {depth.shape[1]}x{depth.shape[0]}, but the images are {camera.width}x{camera.height}"
-        )
+    depth = of_size(_depth(path), camera, path)
     known = np.isfinite(depth) & (depth > 0) & (depth < MAX_DEPTH)
     pixels = np.full(depth.shape, np.nan, np.float32)
     pixels[known] = camera.fx * camera.baseline / depth[known].astype(np.float64)
