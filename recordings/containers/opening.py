@@ -13,8 +13,9 @@ from pathlib import Path
 from recordings.containers.container import Container
 from recordings.containers.finding import find_files, first_bytes
 from recordings.containers.recording import Recording
-from recordings.containers.unpacking import ZSTD_MAGIC, unpacked
+from recordings.containers.unpacking import unpacked
 from recordings.errors import LogError
+from recordings.ros2.cdr import is_packed
 
 _CONTAINERS = (  # the first bytes of each, its module, and its class, which takes some time to import
     (b"\x89MCAP0\r\n", "mcap.file", "McapFile"),
@@ -40,7 +41,7 @@ def open_recording(given: Path | str | Sequence[Path | str]) -> Recording:
 def _open_file(path: Path, stack: ExitStack) -> Container:
     """Open one file; a compressed one, of a folder, is unpacked first."""
     start = first_bytes(path)
-    if start.startswith(ZSTD_MAGIC):
+    if is_packed(start):
         path = unpacked(path, stack)
         start = first_bytes(path)
     for magic, home, name in _CONTAINERS:

@@ -10,7 +10,6 @@ import zstandard
 
 from recordings.errors import LogError, sentence_of
 
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BLOCK_BYTES = 1 << 20
 _MAX_RATIO = 200  # of a recording's size to its compressed size; more is a hostile file
 

@@ -36,21 +36,15 @@ def with_header(message: Any) -> Any:
     """A message of any type with a header of its `timestamp` and `frame_id`, if it has no header of its own."""
     names = [known.name for known in message.DESCRIPTOR.fields] if hasattr(message, "DESCRIPTOR") else vars(message)
     fields = {name: getattr(message, name) for name in names}
-    if "header" in fields:
-        fields["header"] = _ros_header(fields["header"])
-    elif "timestamp" in fields:
-        fields["header"] = _header(message)
+    if "header" in fields or "timestamp" in fields:
+        fields["header"] = _header(fields.get("header", message))
     return SimpleNamespace(**fields)
 
 
 def _header(message: Any, frame: str = "frame_id") -> Any:
-    """A std_msgs/Header of a message's timestamp and frame."""
-    return SimpleNamespace(stamp=_time(message.timestamp), frame_id=str(getattr(message, frame, "")))
-
-
-def _ros_header(header: Any) -> Any:
-    """A ROS header of another encoding."""
-    return SimpleNamespace(stamp=_time(header.stamp), frame_id=str(getattr(header, "frame_id", "")))
+    """A std_msgs/Header of a message's timestamp and frame, or of a ROS header of another encoding."""
+    time = message.stamp if hasattr(message, "stamp") else message.timestamp
+    return SimpleNamespace(stamp=_time(time), frame_id=str(getattr(message, frame, "")))
 
 
 def _time(time: Any) -> Any:

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from flow.contracts import counted
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
 from recordings.containers.timeline import MAX_LOG_TIME, Timeline
-from recordings.containers.unpacking import ZSTD_MAGIC
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import HEAD_BYTES, MAX_CHUNK_BYTES, check_size, chunk_heads, unpack_chunk
 from recordings.mcap.index import (
@@ -39,7 +38,7 @@ from recordings.mcap.index import (
 )
 from recordings.mcap.message_order import ChunkMessages, LastTable, OpenChunks, Ordered, in_log_time_order, too_long
 from recordings.mcap.walk import walk
-from recordings.ros2.cdr import decoder_for
+from recordings.ros2.cdr import decoder_for, is_packed
 
 Edges = tuple[int | None, int | None]  # log times, ns, from which and before which messages are read
 
@@ -150,7 +149,7 @@ class McapFile:
         records = chunk_heads(self._file, place, offsets[wanted].tolist(), size)
         for number, time, record in zip(numbers[wanted].tolist(), times[wanted].tolist(), records, strict=True):
             data = memoryview(record)[RECORD.size + MESSAGE.size :]
-            if record[:1] != bytes([Opcode.MESSAGE]) or data[:4] == ZSTD_MAGIC:
+            if record[:1] != bytes([Opcode.MESSAGE]) or is_packed(data):
                 raise ValueError("there is no message of known start at the offset in the index")
             length = RECORD.unpack_from(record)[1] - MESSAGE.size
             yield RawMessage(number, time, data[:length])

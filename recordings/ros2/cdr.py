@@ -107,7 +107,7 @@ def store_of(schema_name: str, schema_encoding: str, text: bytes) -> SharedTypes
 
 
 def is_packed(data: bytes | memoryview) -> bool:
-    """Whether rosbag2 compressed a message by itself."""
+    """Whether rosbag2 compressed a message or a file by itself."""
     return bytes(data[: len(_ZSTD_MAGIC)]) == _ZSTD_MAGIC  # a memoryview compares slowly
 
 

@@ -125,14 +125,10 @@ class AngleField(Checked):
 
     def __call__(self, message: Any) -> float:
         """The angle in radians, with our sign."""
-        value = self.number(message)
+        value = _number(message, self.field)
         if not np.isfinite(value):
             raise LogError(f"field '{self.field}' contains {value}, which is not an angle")
         return self.sign * float(np.deg2rad(value) if self.unit == "deg" else value)
-
-    def number(self, message: Any) -> float:
-        """The number in the field, maybe NaN. Raises LogError if the message has no such field."""
-        return _number(message, self.field)
 
 
 @dataclass(frozen=True)
@@ -197,8 +193,8 @@ class PlainAngles:
 
     def check(self, message: Any) -> None:
         """Raise LogError if a field is not a number."""
-        self.pitch.number(message)
-        self.roll.number(message)
+        for angle in (self.pitch, self.roll):
+            _number(message, angle.field)
 
     def __call__(self, message: Any, log_time: int) -> Tilt:
         """The tilt by the two angles of a message."""

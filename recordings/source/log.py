@@ -343,13 +343,15 @@ class McapLog:
             return []
         reading, noise = self.resolution.tilt, TiltNoise()
         if reading.estimates:
-            readers = [self._reader("inclinometer", topic, _nothing) for topic in reading.samplers(self.source)]
+            readers = [self._reader("inclinometer", topic, lambda *_: None) for topic in reading.samplers(self.source)]
             return [replace(reader, decoders=dict.fromkeys(reader.decoders, bytes)) for reader in readers]
-        tilt = reading.reader(self.source)
+        tilt, known = reading.reader(self.source), self.resolution.tilt_frame
 
         def checked(message: Any, log_time: int) -> Tilt | None:
             made = tilt(message, log_time)
-            return None if made is None else noise(self._checked_tilt(made))
+            if made is not None and known and made.frame_id != known:
+                raise LogError(f"its frame is '{made.frame_id}', but the mount is that of '{known}'")
+            return None if made is None else noise(made)
 
         return [self._reader("inclinometer", reading.topic, checked)]
 
@@ -361,13 +363,6 @@ class McapLog:
                 yield self._reader("mount", topic, moving.add)
             else:
                 yield replace(pose, item=partial(_both, moving.add, pose.item))
-
-    def _checked_tilt(self, tilt: Tilt) -> Tilt:
-        """The tilt, if it comes from the sensor of the mount."""
-        known = self.resolution.tilt_frame
-        if known and tilt.frame_id != known:
-            raise LogError(f"its frame is '{tilt.frame_id}', but the mount is that of '{known}'")
-        return tilt
 
     def _rover_pose(self, pose: Pose | None) -> Pose | None:
         cameras = self.resolution.cameras
@@ -394,7 +389,3 @@ class McapLog:
 def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], message: Any, log_time: int) -> Any:
     first(message, log_time)
     return then(message, log_time)
-
-
-def _nothing(message: Any, log_time: int) -> None:
-    """No item."""
