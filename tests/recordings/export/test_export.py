@@ -75,6 +75,14 @@ def result(tmp_path: Path) -> Path:
     return path
 
 
+def regional_log(path: Path, *maps: ElevationMap) -> Path:
+    """A result log of regional maps."""
+    with Ros2Writer(path) as writer:
+        for terrain in maps:
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), terrain.stamp)
+    return path
+
+
 def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result, tmp_path):
     export(result, tmp_path / "out")
     with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
@@ -116,12 +124,8 @@ def test_one_file_has_every_layer_as_a_band_with_its_name_and_unit(result, tmp_p
 
 
 def test_the_rim_of_a_window_does_not_replace_the_middle_of_another(tmp_path):
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        for frame, (corner, wrong) in enumerate([((0.0, 0.0), 0.0), ((3.0, 0.0), 9.0)]):
-            terrain, _ = window(frame, corner, (60, 60), wrong)
-            writer.write("/nav/regional_map", ros2.grid_map(terrain), terrain.stamp)
-    export(path, tmp_path)
+    windows = [window(frame, (3.0 * frame, 0.0), (60, 60), 9.0 * frame)[0] for frame in range(2)]
+    export(regional_log(tmp_path / "out.mcap", *windows), tmp_path)
     with rasterio.open(tmp_path / "elevation.tif") as file:
         heights = file.read(1)
         x = np.array([file.xy(30, col)[0] for col in range(file.width)])
@@ -185,14 +189,8 @@ def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path):
     x, y = np.meshgrid((np.arange(60) + 0.5) * STEP, (np.arange(40) + 0.5) * STEP)
     mound = np.exp(-((x - 4) ** 2 + (y - 1) ** 2)).astype(np.float32)
     mound[0, 0] = np.nan
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        writer.write(
-            "/nav/regional_map",
-            ros2.grid_map(ElevationMap(START, {"elevation": mound}, STEP, (0.0, 0.0), "odom")),
-            START,
-        )
-    export(path, tmp_path)
+    terrain = ElevationMap(START, {"elevation": mound}, STEP, (0.0, 0.0), "odom")
+    export(regional_log(tmp_path / "out.mcap", terrain), tmp_path)
     shade = np.asarray(Image.open(tmp_path / "hillshade.png"))
     step_x, _, _, step_y, west, north = (float(line) for line in (tmp_path / "hillshade.pgw").read_text().split())
 
@@ -224,10 +222,7 @@ def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path):
     """In a UTM frame float32 would be off by half a metre."""
     corner = (500_000.3, 5_400_000.7)
     layers = {"elevation": np.array([[1, 2], [3, np.nan]], np.float32)}
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        writer.write("/nav/regional_map", ros2.grid_map(ElevationMap(START, layers, STEP, corner, "map")), START)
-    export(path, tmp_path)
+    export(regional_log(tmp_path / "out.mcap", ElevationMap(START, layers, STEP, corner, "map")), tmp_path)
     points = plyfile.PlyData.read(str(tmp_path / "points.ply"))["vertex"].data
     centres = [
         (corner[0] + 0.05, corner[1] + 0.05),
@@ -280,38 +275,28 @@ def test_a_log_without_nav_topics_is_refused(tmp_path, frames):
         export(path, tmp_path / "out", frames)
 
 
-def regional_log(path: Path, *maps: tuple[str, float]) -> Path:
-    """A result log of regional maps 3 x 3 cells, all of one height, in frames of reference, with cells of a size."""
-    with Ros2Writer(path) as writer:
-        for number, (frame_id, size) in enumerate(maps):
-            layers = {"elevation": np.full((3, 3), number, np.float32)}
-            terrain = ElevationMap(START + number, layers, size, (0.0, 0.0), frame_id)
-            writer.write("/nav/regional_map", ros2.grid_map(terrain), START + number)
-    return path
+def flat(number: int, frame_id: str = "odom", size: float = STEP, place: float = 0.0) -> ElevationMap:
+    """A map of 3 x 3 cells, all of the height `number`."""
+    layers = {"elevation": np.full((3, 3), number, np.float32)}
+    return ElevationMap(START + number, layers, size, (place, place), frame_id)
 
 
 def test_maps_of_different_grids_are_refused(tmp_path):
-    path = regional_log(tmp_path / "out.mcap", ("odom", STEP), ("odom", 2 * STEP))
+    path = regional_log(tmp_path / "out.mcap", flat(0), flat(1, size=2 * STEP))
     with pytest.raises(LogError, match=r"the maps of the log differ: elevation at 0\.2 m in 'odom' after"):
         export(path, tmp_path / "out")
 
 
 def test_a_map_of_a_pose_that_jumped_is_refused_before_it_fills_the_disk(tmp_path):
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        for frame, place in enumerate((0.0, 50_000.0)):
-            terrain = ElevationMap(
-                START + frame, {"elevation": np.ones((3, 3), np.float32)}, STEP, (place,) * 2, "odom"
-            )
-            writer.write("/nav/regional_map", ros2.grid_map(terrain), START + frame)
+    path = regional_log(tmp_path / "out.mcap", flat(0), flat(1, place=50_000.0))
     with pytest.raises(LogError, match=r"'odom' is 50000\.3 x 50000\.3 m, .*add --frames"):
         export(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 def test_a_regional_map_that_was_reset_has_a_folder_per_frame_id(tmp_path):
-    names = ("visual_odom", "visual_odom/2")
-    export(regional_log(tmp_path / "out.mcap", *((name, STEP) for name in names)), tmp_path / "out")
+    maps = flat(0, "visual_odom"), flat(1, "visual_odom/2")
+    export(regional_log(tmp_path / "out.mcap", *maps), tmp_path / "out")
     for number, folder in enumerate(("visual_odom", "visual_odom-2")):
         with rasterio.open(tmp_path / "out" / folder / "elevation.tif") as file:
             assert np.unique(file.read(1)[np.isfinite(file.read(1))]) == [number]
