@@ -75,20 +75,14 @@ def test_wls_weighs_matches_by_their_confidence() -> None:
     assert middle[1] < middle[0] - 0.1
 
 
-def test_a_frame_without_matches_keeps_its_reasons() -> None:
-    frame, _ = scene()
-    nothing = matched(np.full(SHAPE, np.nan, np.float32))
-    refined = RefinePaper()(frame, nothing)
-    assert np.isnan(refined.pixels).all()
-    assert (refined.source == PixelOrigin.SPECKLE).all()
-
-
-def test_an_unfilled_pixel_has_no_code_of_a_known_one() -> None:
+def test_a_frame_without_matches_keeps_its_reasons_but_no_code_of_a_known_pixel() -> None:
     frame, matches = scene()
+    nothing = matched(np.full(SHAPE, np.nan, np.float32))
     planes_only = replace(matches, source=np.full(SHAPE, PixelOrigin.PLANE, np.uint8))
-    refined = RefinePaper()(frame, planes_only)
-    assert np.isnan(refined.pixels).all()
-    assert (refined.source == PixelOrigin.UNKNOWN).all()
+    for given, code in ((nothing, PixelOrigin.SPECKLE), (planes_only, PixelOrigin.UNKNOWN)):
+        refined = RefinePaper()(frame, given)
+        assert np.isnan(refined.pixels).all()
+        assert (refined.source == code).all()
 
 
 def test_the_stamp_decides_every_bit_also_of_two_frames_at_once() -> None:
