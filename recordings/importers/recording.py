@@ -56,9 +56,8 @@ class ImportedRecording:
 
     cameras: left and right; rectified: whether the images are; pairs: in the order of stamps; mounts: static
     transforms, None for an unknown one; sensors: streams of (stamp, topic, message), each in the order of stamps;
-    truth: the exact poses, of which those at the frames are written; true_tilt: whether they are better than the
-    sensors' tilt; more: further messages of a frame; metadata: name and content of a record; notes: what a user should
-    know.
+    truth: the exact poses, written at the frames; true_tilt: whether they are better than the sensors' tilt; more:
+    further messages of a frame; metadata: name and content of a record; notes: what a user should know.
     """
 
     cameras: tuple[CameraModel, CameraModel]
