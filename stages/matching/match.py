@@ -254,7 +254,7 @@ class Match(Stage):
             seen = information(left, slopes[0], noise * F32(math.sqrt(max(ratio, 1))), self.threads)
             gain = 1 + F32(self.weak_texture_gain - 1) * np.minimum(match_variance(seen), 1)
         if self.denoise:
-            left, right = denoised((left, right), noise * F32(math.sqrt(min(ratio, 1))))
+            left, right = denoised((left, right), noise * F32(math.sqrt(min(ratio, 1))), self.threads)
         return gain, left, right
 
     def _prior_costs(

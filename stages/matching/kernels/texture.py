@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import fast_kernel, kernel
 from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array, PixelOrigin
 
@@ -29,6 +29,10 @@ MIN_INFORMATION = 1e-3  # of a pixel, 1/px^2
 # Standard deviation of a match whose bound is s: FLOOR and CEILING s^2 / (s^2 + HALF^2), added in squares. Measured on
 # ground away from depth edges.
 FLOOR, CEILING, HALF = 0.05, 1.0, 0.42  # px
+DETAIL_SCALE, RADIUS = 1.0, 3  # px: standard deviation and radius of the Gaussian that separates detail from the rest
+WEIGHTS = cv2.getGaussianKernel(2 * RADIUS + 1, DETAIL_SCALE)[RADIUS:, 0]  # of that Gaussian, from its middle on
+REACH = 2  # px, radius of the neighbourhood over which the power of the detail is measured
+AREA, RING, LEAST_POWER = (2 * REACH + 1) ** 2, 2 * REACH + 1, 1e-6  # px; rows; squared gray levels
 
 
 def gradient(image: Array) -> Array:
@@ -138,6 +142,51 @@ def _add_texture(image, slopes, scale, first, end, layers):
             layers[1, y // BLOCK, x // BLOCK] += F32(1)
 
 
+def without_noise(image: Array, variance: Array) -> Array:
+    """An image (H, W) uint8 without noise whose `variance` in the detail is given at each gray level, (256,) float32.
+
+    The trick: the last rows of each step are kept in rings, so that an image is read and written once.
+    """
+    result = np.empty_like(image)
+    wide = cv2.copyMakeBorder(image, *(RADIUS + REACH,) * 4, cv2.BORDER_REFLECT_101)
+    _reduce_noise(wide, WEIGHTS.astype(np.float32), variance, result)
+    return result
+
+
+@fast_kernel
+def _reduce_noise(image, weights, variance, result):
+    """Write the image without noise to `result`; it has a border of RADIUS + REACH px."""
+    height, width = result.shape
+    wide = width + 2 * REACH
+    w0, w1, w2, w3 = weights[0], weights[1], weights[2], weights[3]
+    mean, row = np.empty((RING, wide), np.float32), np.empty(wide + 2 * RADIUS, np.float32)
+    detail, power = np.empty((RING, wide), np.float32), np.empty((RING, width), np.float32)
+    for y in range(height + 2 * REACH):
+        r0, r1, r2, r3, r4, r5, r6 = (
+            image[y], image[y + 1], image[y + 2], image[y + 3], image[y + 4], image[y + 5], image[y + 6]
+        )  # fmt: skip
+        for x in range(wide + 2 * RADIUS):
+            total = w0 * F32(r3[x]) + w1 * (F32(r2[x]) + F32(r4[x]))
+            row[x] = total + w2 * (F32(r1[x]) + F32(r5[x])) + w3 * (F32(r0[x]) + F32(r6[x]))
+        m, d, p = mean[y % RING], detail[y % RING], power[y % RING]
+        for x in range(wide):
+            total = w0 * row[x + 3] + w1 * (row[x + 2] + row[x + 4])
+            m[x] = total + w2 * (row[x + 1] + row[x + 5]) + w3 * (row[x] + row[x + 6])
+            d[x] = F32(r3[x + RADIUS]) - m[x]
+        for x in range(width):
+            p[x] = d[x] * d[x] + d[x + 1] * d[x + 1] + d[x + 2] * d[x + 2] + d[x + 3] * d[x + 3] + d[x + 4] * d[x + 4]
+        if y < 2 * REACH:
+            continue
+        m, d, levels, target = mean[(y - REACH) % RING], detail[(y - REACH) % RING], r1[RADIUS + REACH :], result[y - 4]
+        for x in range(width):
+            row[x] = variance[levels[x]]
+        for x in range(width):
+            total = power[0, x] + power[1, x] + power[2, x] + power[3, x] + power[4, x]
+            share = min(row[x] / max(total * F32(1 / AREA), F32(LEAST_POWER)), F32(1))
+            level = m[x + REACH] + (F32(1) - share) * d[x + REACH]
+            target[x] = np.uint8(min(max(level + F32(0.5), F32(0)), F32(255)))
+
+
 def contrast(image: Array, first: int, end: int) -> Array:
     """The range of the gray levels in the window of each pixel of rows first to end, (end - first, W) uint8.
 
@@ -193,3 +242,12 @@ def information_reference(image: Array, slopes: Array, noise: Array) -> Array:
         block = seen[j * BLOCK : (j + 1) * BLOCK, i * BLOCK : (i + 1) * BLOCK]
         layers[:, j, i] = block.sum(), block.size
     return layers
+
+
+def without_noise_reference(image: Array, variance: Array) -> Array:
+    """`without_noise` by OpenCV's filters, in float64: the gray levels before rounding."""
+    pixels, row = image.astype(np.float64), np.concatenate([WEIGHTS[:0:-1], WEIGHTS])
+    smooth = cv2.sepFilter2D(pixels, -1, row, row)
+    detail = pixels - smooth
+    power = np.maximum(cv2.sqrBoxFilter(detail, -1, (2 * REACH + 1,) * 2), LEAST_POWER)
+    return np.asarray(np.clip(smooth + (1 - np.minimum(variance[image] / power, 1)) * detail, 0, 255))

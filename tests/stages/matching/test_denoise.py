@@ -6,6 +6,7 @@ import pytest
 
 from stages import Disparity, Match, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.denoise import denoised
+from stages.matching.kernels.texture import without_noise, without_noise_reference
 
 WIDTH, HEIGHT, SHIFT = 320, 240, 12
 
@@ -33,6 +34,15 @@ def match(images, denoise):
     prior = Disparity(7, pixels, source, np.ones(shape, np.float32))
     stage = Match(disparities=32, denoise=denoise, prior_weight=0.1, weak_texture_gain=1)
     return stage(StereoFrame(7, *images, camera), prior).pixels[8:-8, 40:-8]
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 9), (17, 3), (40, 57)])
+def test_gray_levels_equal_the_reference(shape):
+    rng = np.random.default_rng(shape[1])
+    image = rng.integers(0, 256, shape, np.uint8)
+    image[: shape[0] // 2] = image[: shape[0] // 2] // 64 + 100
+    variance = rng.uniform(0, 40, 256).astype(np.float32)
+    assert np.abs(without_noise(image, variance) - without_noise_reference(image, variance)).max() < 0.501
 
 
 def test_noise_without_texture_is_reduced_to_half():
