@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import cast
+from functools import cached_property
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -14,6 +16,7 @@ from stages.data.arrays import Array, publish, publish_image, publish_stamp, pub
 CALIBRATION_RTOL = 1e-3  # by which focal lengths or cy of a rectified pair may differ: a pixel at 1000 px
 _OPENCV = (0, 4, 5, 8, 12, 14)  # numbers of coefficients; they define the model, whatever a driver calls it
 DISTORTION_SIZES = {"plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (4,)}
+Derived = TypeVar("Derived")
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,6 +240,17 @@ class StereoFrame:
                 f"StereoFrame: images are {self.left.shape[1]}x{self.left.shape[0]}, "
                 f"the calibration is for {self.camera.width}x{self.camera.height}"
             )
+
+    @cached_property
+    def _derived(self) -> dict[Any, Any]:
+        return {}
+
+    def once(self, derive: Callable[..., Derived], *given: Hashable) -> Derived:
+        """`derive(frame, *given)`, which is kept: stages share what they derive from the same images."""
+        key = derive, given
+        if key not in self._derived:
+            self._derived[key] = derive(self, *given)
+        return cast(Derived, self._derived[key])
 
 
 @dataclass(frozen=True, eq=False)

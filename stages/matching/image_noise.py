@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array, ImageNoise, StereoFrame
-from stages.matching.intensity import eight_bit, gray
+from stages.matching.intensity import gray_pair
 from stages.stage import Stage
 
 # Along rows and columns. The lens blurs what it shows of texture; white noise of variance 1 keeps that variance.
@@ -50,7 +50,12 @@ class MeasureNoise(Stage):
     """
 
     def __call__(self, frame: StereoFrame) -> ImageNoise:
-        return ImageNoise(frame.stamp, noise_levels(gray(eight_bit(frame.left, frame.right)[0])))
+        return ImageNoise(frame.stamp, frame.once(frame_noise))
+
+
+def frame_noise(frame: StereoFrame) -> Array:
+    """`noise_levels` of the left image in gray."""
+    return noise_levels(frame.once(gray_pair)[0])
 
 
 def noise_levels(image: Array) -> Array:
@@ -62,7 +67,7 @@ def noise_levels(image: Array) -> Array:
     if not level.size:  # a black or white image
         return np.full(LEVELS, np.sqrt(MIN_VARIANCE), np.float32)
     levels = np.array([level[group].mean() for group in groups])
-    smooth = np.array([np.quantile(variance[group], SMOOTH_SHARE) for group in groups]) / SMOOTH_VARIANCE
+    smooth = np.array([_quantile(variance[group], SMOOTH_SHARE) for group in groups]) / SMOOTH_VARIANCE
     offset, gain = _line(levels, np.maximum(smooth, MIN_VARIANCE), np.array([group.sum() for group in groups]))
     return np.asarray(np.sqrt(MIN_VARIANCE + offset + gain * np.arange(LEVELS)), dtype=np.float32)
 
@@ -78,6 +83,15 @@ def _samples(image: Array) -> tuple[Array, Array]:
     level = cv2.resize(whole, (cols, rows), interpolation=cv2.INTER_AREA).ravel()
     unclipped = (level >= DARKEST) & (level <= BRIGHTEST)
     return variance[unclipped], level[unclipped]
+
+
+def _quantile(values: Array, share: float) -> float:
+    """`np.quantile`, in a third of the time for few values."""
+    place = share * (len(values) - 1)
+    below, above = int(place), min(int(place) + 1, len(values) - 1)
+    low, high = np.partition(values, (below, above))[[below, above]]
+    near = place - below
+    return float(low + (high - low) * near if near < 0.5 else high - (high - low) * (1 - near))
 
 
 def _line(level: Array, variance: Array, count: Array) -> tuple[float, float]:

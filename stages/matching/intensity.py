@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.data import Array
+from stages.data import Array, StereoFrame
 
 BLACK_SHARE, WHITE_SHARE = 0.001, 0.999  # shares of the values at and below the black and the white level
 
@@ -27,6 +27,12 @@ def eight_bit(*images: Array) -> tuple[Array, ...]:
     stretched = (np.arange(2**16) - low) * (255 / max(high - low, 1)) + 0.5
     table = np.clip(stretched, 0, 255).astype(np.uint8)
     return tuple(table[image] for image in images)
+
+
+def gray_pair(frame: StereoFrame) -> tuple[Array, Array]:
+    """The images of a frame as gray (H, W) uint8."""
+    left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
+    return left, right
 
 
 def alike(left: Array, right: Array) -> tuple[Array, Array]:

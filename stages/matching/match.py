@@ -19,14 +19,14 @@ from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.denoise import denoised
 from stages.matching.far_rows import far_rows
-from stages.matching.image_noise import noise_levels
-from stages.matching.intensity import eight_bit, gray
+from stages.matching.image_noise import frame_noise
+from stages.matching.intensity import gray_pair
 from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
 from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, whole_range
 from stages.matching.kernels.semiglobal import Matches, match
 from stages.matching.kernels.sgm_local import SearchWindows, windows_around
 from stages.matching.kernels.sgm_params import SgmParams
-from stages.matching.kernels.texture import gradient, information, match_variance, noise_ratio
+from stages.matching.kernels.texture import information, match_variance, noise_ratio, slopes
 from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32
@@ -175,16 +175,16 @@ class Match(Stage):
         first, end = far_rows(prior, frame.camera, self.max_prior_step, self.max_prior_depth)
         first = max(min(first, end - MIN_SIDE, len(frame.left) - MIN_SIDE), 0)
         end = max(end, first + MIN_SIDE)
-        found = self._matched(frame_rows(frame, first, end), disparity_rows(prior, first, end))
+        found = self._matched(frame.once(frame_rows, first, end), disparity_rows(prior, first, end))
         return with_rows(replace(prior, camera=frame.camera), first, found)
 
     def _matched(self, frame: StereoFrame, prior: Disparity | None) -> Disparity:
-        left, right = (gray(image) for image in eight_bit(frame.left, frame.right))
+        left, right = frame.once(gray_pair)
         search = self._search_range(frame.camera)
         area = self._search_area(prior, search, len(left))
         guide = None
         if prior is not None:
-            gain, left, right = self._noise_measures(prior, left, right)
+            gain, left, right = self._noise_measures(prior, frame)
             guide = self._prior_costs(prior, search, area, gain)
         excluded = None if prior is None else self._excluded(prior, search, area)
         found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
@@ -239,19 +239,20 @@ class Match(Stage):
             return row_ranges(prior.pixels, self.band_height, search.start, len(search), self.threads)
         return whole_range(rows, len(search))
 
-    def _noise_measures(self, prior: Disparity, left: Array, right: Array) -> tuple[Array | None, Array, Array]:
+    def _noise_measures(self, prior: Disparity, frame: StereoFrame) -> tuple[Array | None, Array, Array]:
         """What noise asks for: the factor of `prior_weight` in each block of pixels, or None, and the images to match.
 
         Noise is what the left image shows as such and what the two images do not share at the prior's disparities.
         """
+        left, right = frame.once(gray_pair)
         weighted = self.prior_weight > 0 and self.weak_texture_gain > 1
         if not weighted and not self.denoise:
             return None, left, right
-        slopes, noise = (gradient(left), gradient(right)), noise_levels(left)
-        ratio = noise_ratio(prior.pixels, left, slopes, noise, self.threads)
+        both, noise = frame.once(slopes), frame.once(frame_noise)
+        ratio = noise_ratio(prior.pixels, left, both, noise, self.threads)
         gain = None
         if weighted:
-            seen = information(left, slopes[0], noise * F32(math.sqrt(max(ratio, 1))), self.threads)
+            seen = information(left, both[0], noise * F32(math.sqrt(max(ratio, 1))), self.threads)
             gain = 1 + F32(self.weak_texture_gain - 1) * np.minimum(match_variance(seen), 1)
         if self.denoise:
             left, right = denoised((left, right), noise * F32(math.sqrt(min(ratio, 1))), self.threads)

@@ -15,9 +15,9 @@ import numpy as np
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
 from stages.data.rows import disparity_rows, frame_rows, with_rows
-from stages.matching.image_noise import noise_levels
-from stages.matching.intensity import alike, eight_bit, gray
-from stages.matching.kernels.texture import contrast
+from stages.matching.image_noise import frame_noise
+from stages.matching.intensity import alike, eight_bit, gray_pair
+from stages.matching.kernels.texture import contrast, slopes
 from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
@@ -136,12 +136,12 @@ class Refine(Stage):
         if not 0 < len(matched) < len(disparity.pixels):
             return self._refined(frame, disparity)
         first, end = int(matched[0]), int(matched[-1]) + 1
-        refined = self._refined(frame_rows(frame, first, end), disparity_rows(disparity, first, end))
+        refined = self._refined(frame.once(frame_rows, first, end), disparity_rows(disparity, first, end))
         return with_rows(replace(disparity, costs=None, camera=frame.camera), first, refined)
 
     def _refined(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         image, other = eight_bit(frame.left, frame.right)
-        guide, right = gray(image), gray(other)
+        guide, right = frame.once(gray_pair)
         saturated = _saturated(frame.left, guide, SATURATION_LEVEL, self.threads)
         matches, weights, reasons = self._matches(disparity, saturated, guide, right)
         smoothed = self._median(matches)
@@ -149,7 +149,7 @@ class Refine(Stage):
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image)
         sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, *alike(image, other))
-        refined, sigma, consistent = self._supported(sharp, kinds != KEPT, guide, right)
+        refined, sigma, consistent = self._supported(sharp, kinds != KEPT, frame)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
             self.threads,
@@ -221,11 +221,12 @@ class Refine(Stage):
             return pixels
         return joint_bilateral(pixels, guide, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY, self.threads)
 
-    def _supported(self, pixels: Array, guessed: Array, guide: Array, right: Array) -> tuple[Array, Array, Array]:
+    def _supported(self, pixels: Array, guessed: Array, frame: StereoFrame) -> tuple[Array, Array, Array]:
         """The supported disparities, their sigma, px, and where the images agree with them, (H, W) bool."""
         if not self.support:
             return pixels, np.zeros(pixels.shape, np.float32), np.ones(pixels.shape, bool)
-        found = supported(pixels, guessed, guide, right, noise_levels(guide), self.threads)
+        guide, both, noise = frame.once(gray_pair)[0], frame.once(slopes), frame.once(frame_noise)
+        found = supported(pixels, guessed, guide, both, noise, self.threads)
         consistent = found.sigma <= F32(self.max_sigma)
         if self.min_correlation:
             consistent &= found.correlation >= F32(self.min_correlation)

@@ -12,7 +12,8 @@ import numpy as np
 
 from stages.compiled.jit import fast_kernel, kernel
 from stages.compiled.parallel import by_bands, shared_by, with_margin
-from stages.data import Array, PixelOrigin
+from stages.data import Array, PixelOrigin, StereoFrame
+from stages.matching.intensity import gray_pair
 
 F32 = np.float32
 BLANK = int(PixelOrigin.BLANK)
@@ -38,6 +39,12 @@ AREA, RING, LEAST_POWER = (2 * REACH + 1) ** 2, 2 * REACH + 1, 1e-6  # px; rows;
 def gradient(image: Array) -> Array:
     """Gradient along the row, times GRADIENT_GAIN, (H, W) int16, of an image (H, W) uint8."""
     return cv2.sepFilter2D(image, cv2.CV_16S, DERIVATIVE, SMOOTHING, borderType=cv2.BORDER_REPLICATE)
+
+
+def slopes(frame: StereoFrame) -> tuple[Array, Array]:
+    """`gradient` of both images of a frame in gray."""
+    left, right = frame.once(gray_pair)
+    return gradient(left), gradient(right)
 
 
 def information_scale(noise: Array) -> Array:

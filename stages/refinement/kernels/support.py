@@ -17,7 +17,6 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.matching.kernels.texture import (
     BLOCK,
-    gradient,
     information,
     information_scale,
     match_variance,
@@ -77,14 +76,16 @@ class Support(NamedTuple):
     correlation: Array
 
 
-def supported(pixels: Array, guessed: Array, left: Array, right: Array, noise: Array, threads: int = 1) -> Support:
+def supported(
+    pixels: Array, guessed: Array, left: Array, slopes: tuple[Array, Array], noise: Array, threads: int = 1
+) -> Support:
     """Disparities with as much support as their texture asks for.
 
-    pixels: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, pixels that are no evidence; left, right: (H, W)
-    uint8; noise: (256,) float32, standard deviation of a pixel at each gray level.
+    pixels: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, pixels that are no evidence; left: (H, W) uint8;
+    slopes: `texture.gradient` of left and right image; noise: (256,) float32, standard deviation of a pixel at each
+    gray level.
     """
     both = shared_by(threads)
-    slopes = both(lambda: gradient(left), lambda: gradient(right))
     noise = stereo_noise(np.where(guessed, F32(np.nan), pixels), left, slopes, noise, threads)
     texture = information(left, slopes[0], noise, threads)
     variance, first_row = match_variance(texture), sky_end(texture, left, noise)

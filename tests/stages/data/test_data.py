@@ -144,6 +144,18 @@ def test_a_pair_of_images_of_different_depth_is_refused() -> None:
         StereoFrame(0, left, left.astype(np.uint16), CAMERA)
 
 
+def test_what_stages_derive_from_a_frame_is_made_once() -> None:
+    image, rows = np.zeros((480, 640), U8), []
+
+    def derive(frame: StereoFrame, row: int) -> int:
+        rows.append(row)
+        return row + len(frame.left)
+
+    frame = StereoFrame(0, image, image, CAMERA)
+    assert [frame.once(derive, row) for row in (3, 4, 3)] == [483, 484, 483]
+    assert rows == [3, 4]
+
+
 @pytest.mark.parametrize("frames", [("map", "base"), ("odom", "mast")])
 def test_poses_of_different_frames_are_not_interpolated(frames: tuple[str, str]) -> None:
     first = Pose(0, np.zeros(3), QUATERNION, "odom", "base")

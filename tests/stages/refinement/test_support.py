@@ -40,6 +40,11 @@ def case(height, width, seed):
     return pixels, rng.random(pixels.shape) < 0.2, images, rng.uniform(0.5, 3, 256).astype(np.float32)
 
 
+def seen(left, right):
+    """What `supported` gets of two images: the left one, the gradients of both, and the noise."""
+    return left, (gradient(left), gradient(right)), noise_levels(left)
+
+
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 2**31), st.sampled_from([1, 2]))
 def test_sums_of_both_sizes_equal_the_reference(height, width, seed, threads):
     pixels, guessed, (left, right), noise = case(height, width, seed)
@@ -138,19 +143,19 @@ def test_weak_texture_gets_planes_and_strong_texture_keeps_its_matches():
     away = np.ones(truth.shape, bool)
     away[60:101, 100:141] = False
     left, right = views(2.0, truth)
-    weak = supported(matches, nothing_guessed, left, right, noise_levels(left))
+    weak = supported(matches, nothing_guessed, *seen(left, right))
     assert rms((weak.pixels - truth)[away]) < 0.4 * rms((matches - truth)[away])
     truth, matches = ground(noise=0.05)
     relief = (matches + 0.3 * np.sin(np.arange(240) / 3)).astype(np.float32)
     left, right = views(30.0, relief)
-    strong = supported(relief, nothing_guessed, left, right, noise_levels(left))
+    strong = supported(relief, nothing_guessed, *seen(left, right))
     assert rms((strong.pixels - relief)[away]) < 0.05
 
 
 def test_a_small_rock_on_weak_texture_keeps_its_height():
     truth, matches = ground(noise=0.4)
     left, right = views(2.0, truth)
-    found = supported(matches, np.zeros(truth.shape, bool), left, right, noise_levels(left)).pixels
+    found = supported(matches, np.zeros(truth.shape, bool), *seen(left, right)).pixels
     assert np.median((found - truth)[72:89, 112:129]) == pytest.approx(0, abs=0.3)
     assert rms((found - truth)[40:60, 100:140]) < 0.25
 
@@ -161,7 +166,7 @@ def test_sigma_contains_the_errors_it_states():
     away[60:101, 100:141] = False
     for contrast in (1.0, 2.0):
         left, right = views(contrast, truth)
-        found = supported(matches, np.zeros(truth.shape, bool), left, right, noise_levels(left))
+        found = supported(matches, np.zeros(truth.shape, bool), *seen(left, right))
         assert np.mean(abs(found.pixels - truth)[away] < 2 * found.sigma[away]) > 0.8
 
 
@@ -170,7 +175,7 @@ def test_matches_of_noise_have_no_correlation_and_a_large_sigma():
         np.rint(np.random.default_rng(seed).normal(120, 1.5, (160, 240))).astype(np.uint8) for seed in (1, 2)
     )
     _, matches = ground(noise=0.4)
-    found = supported(matches, np.zeros(left.shape, bool), left, right, noise_levels(left))
+    found = supported(matches, np.zeros(left.shape, bool), *seen(left, right))
     assert np.mean((found.correlation > 0.4) & (found.sigma < 0.5)) < 0.02
 
 
@@ -180,7 +185,7 @@ def test_a_guess_is_evidence_only_where_matches_share_its_block():
     guessed = np.zeros(truth.shape, bool)
     guessed[20:40, 20:40] = True
     guessed[100:103, 60] = True
-    found = supported(matches, guessed, left, right, noise_levels(left))
+    found = supported(matches, guessed, *seen(left, right))
     assert np.all(found.sigma[20:40, 20:40] > 100)
     assert np.all(found.sigma[100:103, 60] < 0.5)
 
@@ -188,6 +193,6 @@ def test_a_guess_is_evidence_only_where_matches_share_its_block():
 def test_threads_do_not_change_the_result():
     truth, matches = ground(noise=0.4)
     left, right = views(2.0, truth)
-    given = matches, np.zeros(truth.shape, bool), left, right, noise_levels(left)
+    given = matches, np.zeros(truth.shape, bool), *seen(left, right)
     for one, two in zip(supported(*given, 1), supported(*given, 2), strict=True):
         assert np.array_equal(one, two)
