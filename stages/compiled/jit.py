@@ -87,6 +87,10 @@ _njit: Any = njit  # whose published type lacks the options on wrappers
 # compiling takes a third less time.
 kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
 part: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
+# `part`, inlined into its callers: arrays that it takes are not counted, which pays in an inner loop.
+inlined_part: Any = _njit(
+    nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True, forceinline=True
+)
 # The same for arithmetic without NaN and infinity, whose sums may be taken in any order; as deterministic.
 fast_kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)
 # Inlined into its callers: of several compiled copies numba would use the first for all of them, and each copy may

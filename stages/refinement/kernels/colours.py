@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import part
+from stages.compiled.jit import inlined_part
 from stages.data import Array
 
 BYTE, GREEN, BLUE = np.uint32(255), np.uint32(8), np.uint32(16)  # a channel's mask, and the channels' shifts
@@ -18,10 +18,13 @@ def packed(image: Array) -> Array:
     return colours
 
 
-@part
+@inlined_part
 def levels_apart(one, other):
-    """Levels between two packed colours in the channel that differs most."""
-    red = abs(np.int32(one & BYTE) - np.int32(other & BYTE))
-    green = abs(np.int32((one >> GREEN) & BYTE) - np.int32((other >> GREEN) & BYTE))
-    blue = abs(np.int32((one >> BLUE) & BYTE) - np.int32((other >> BLUE) & BYTE))
-    return max(red, max(green, blue))
+    """Levels between two packed colours in the channel that differs most.
+
+    numba widens every sum to 64 bits; cut to 32 at once, sixteen of them fit a vector.
+    """
+    red = np.int32(np.int32(one & BYTE) - np.int32(other & BYTE))
+    green = np.int32(np.int32((one >> GREEN) & BYTE) - np.int32((other >> GREEN) & BYTE))
+    blue = np.int32(np.int32((one >> BLUE) & BYTE) - np.int32((other >> BLUE) & BYTE))
+    return np.int32(max(abs(red), max(abs(green), abs(blue))))

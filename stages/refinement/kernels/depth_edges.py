@@ -4,7 +4,8 @@ A match at the edge of a rock is often one pixel off. The smallest and the large
 two candidates: the ground behind and the rock in front. The log odds of the rock are a sum of two kinds of evidence. In
 a window, pixels of similar colour are mostly on the same side (Yoon and Kweon, 2006). Around the pixel, the images
 differ less at the right disparity. Its own row counts more, because the upper edge of a rock lies along the row. What
-moved may uncover a neighbour that is off as well, so the neighbours of moved pixels choose once more.
+moved may uncover a neighbour that is off as well, so the neighbours of moved pixels choose once more. The trick: the
+compiler makes vectors of the sums, as pixels are decided in batches and no number is wider than 32 bits.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import kernel, part
+from stages.compiled.jit import inlined_part, kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.refinement.kernels.colours import BYTE, GREEN, levels_apart, packed
@@ -29,6 +30,7 @@ MAX_DIFFERENCE = 12  # levels between the images that count
 REACH = 2  # px, of the window that compares the images: 3 x 3 px, and 5 px in its row, which count twice
 WINDOW = np.array([(v, u) for v in (-1, 0, 1) for u in range(-REACH, REACH + 1) if v == 0 or abs(u) < 2])
 WINDOW_WEIGHTS = np.where(WINDOW[:, 0] == 0, 2, 1)
+BATCH = 144  # pixels that are decided together
 SAMPLE = 16  # rows and columns between the pixels that compare the images' exposures
 FRACTIONS = 256  # of a pixel
 RED_BLUE = np.uint32(0xFF00FF)  # channels that one multiplication mixes
@@ -96,24 +98,21 @@ def _exposed(disparity: Array, guessed: Array, left: Array, right: Array) -> Arr
 def _find_jumps(disparity, radius, jump, found, first, end):
     """Mark the pixels of rows first to end with a jump to one of their eight neighbours; disparity has a border."""
     for y in range(first, end):
-        rows = disparity[y + radius - 1 : y + radius + 2, radius - 1 :]
-        _mark_jumps(rows[0], rows[1], rows[2], jump, found[y])
+        above, row, below = y + radius - 1, y + radius, y + radius + 1
+        start = radius - 1
+        _mark_jumps(disparity[above, start:], disparity[row, start:], disparity[below, start:], jump, found[y])
 
 
-@part
+@inlined_part
 def _mark_jumps(above, row, below, jump, found):
-    """Mark the pixels of a row; the rows begin one pixel before it."""
-    for x in range(found.size):
-        d, most = row[x + 1], F32(0)
-        most = _larger(abs(row[x] - d), _larger(abs(row[x + 2] - d), most))
-        most = _larger(abs(above[x] - d), _larger(abs(above[x + 1] - d), _larger(abs(above[x + 2] - d), most)))
-        most = _larger(abs(below[x] - d), _larger(abs(below[x + 1] - d), _larger(abs(below[x + 2] - d), most)))
-        found[x] = most > jump
-
-
-@part
-def _larger(value, most):
-    return value if value > most else most  # which leaves out an unknown value
+    """Mark the pixels of a row; the rows begin one pixel before it. Every test is made, so that the loop vectorises."""
+    for x in range(np.uint64(found.size)):  # without sign: numba looks for no negative index
+        here, after = x + np.uint64(1), x + np.uint64(2)
+        d = row[here]
+        beside = (abs(row[x] - d) > jump) | (abs(row[after] - d) > jump)
+        upper = (abs(above[x] - d) > jump) | (abs(above[here] - d) > jump) | (abs(above[after] - d) > jump)
+        lower = (abs(below[x] - d) > jump) | (abs(below[here] - d) > jump) | (abs(below[after] - d) > jump)
+        found[x] = beside | upper | lower
 
 
 @kernel
@@ -121,9 +120,22 @@ def _sharpen(
     disparity, matches, guessed, guide, right, window, taps, table, weight, radius, jump, asked, sharp, moved,
     first, end,
 ):  # fmt: skip
-    """Sharpen the pixels of rows first to end that are asked; disparity, matches and guide have a border."""
+    """Sharpen the pixels of rows first to end that are asked; disparity, matches and guide have a border.
+
+    They are decided in batches, whose pixels lie side by side in the work arrays.
+    """
     stride, columns = disparity.shape[1], np.empty(sharp.shape[1] + 1, np.int64)
-    everything, certain, colours = disparity.reshape(-1), matches.reshape(-1), guide.reshape(-1)
+    everything, certain, count = disparity.reshape(-1), matches.reshape(-1), 0
+    places, sides = np.empty((3, BATCH), np.int64), np.empty((2, BATCH), np.float32)
+    # Side by side: disparities and colours of the taps, the middle disparity, the own colour, weights and votes; the
+    # colours that the images have in the window, the fractions, whether it lies inside, and how much they differ
+    work = (
+        np.empty((taps.size, BATCH), np.float32), np.empty((taps.size, BATCH), np.uint32), np.empty(BATCH, np.float32),
+        np.empty(BATCH, np.uint32), np.empty(BATCH, np.int32), np.empty(BATCH, np.int32),
+        np.empty((window.shape[1], 5, BATCH), np.uint32), np.empty((2, BATCH), np.uint32), np.empty(BATCH, np.bool_),
+        np.empty(BATCH, np.int32),
+    )  # fmt: skip
+    given = everything, certain, guessed, guide.reshape(-1), right, window, taps, table, weight, stride, places, sides
     for y in range(first, end):
         for n in range(_listed(asked[y], columns)):
             x = columns[n]
@@ -131,11 +143,40 @@ def _sharpen(
             at = np.int64((y + radius) * stride + x + radius)
             low, high = _candidates(flat, at, stride)
             if max(high - flat[at], flat[at] - low) > jump:
-                middle = F32(0.5) * (low + high)
-                odds = ODDS + weight * F32(_vote(flat, colours, taps, table, at, middle))
-                odds += ODDS_PER_LEVEL * F32(_worse(colours, at, right, window, y, x, low, high))
-                if (odds > 0) != (flat[at] > middle):
-                    sharp[y, x], moved[y, x] = _neighbours(flat, at, stride, middle, odds > 0), True
+                places[0, count], places[1, count], places[2, count] = y, x, at
+                sides[0, count], sides[1, count] = low, high
+                count += 1
+            if count == BATCH:
+                _decide(given, count, work, sharp, moved)
+                count = 0
+    _decide(given, count, work, sharp, moved)
+
+
+@inlined_part
+def _decide(given, count, work, sharp, moved):
+    """Move the first `count` pixels of a batch to the other side where the evidence says so."""
+    everything, certain, guessed, colours, right, window, taps, table, weight, stride, places, sides = given
+    around, shades, middles, own, weights, votes, views, shares, inside, differences = work
+    for i in range(np.uint64(count)):
+        y, x, at = places[0, i], places[1, i], places[2, i]
+        flat = everything if guessed[y, x] else certain
+        middles[i], own[i] = F32(0.5) * (sides[0, i] + sides[1, i]), colours[at]
+        for k in range(np.uint64(taps.size)):
+            place = np.uint64(at + taps[k])
+            around[k, i], shades[k, i] = flat[place], colours[place]
+        inside[i] = _take_views(colours, at, right, window, y, x, sides, i, views, shares)
+    votes[:], differences[:] = 0, 0
+    for k in range(taps.size):
+        _add_votes(around[k], shades[k], middles, own, table, weights, votes, count)
+    for k in range(window.shape[1]):
+        _add_differences(views[k], shares[0], shares[1], np.int32(window[2, k]), differences, count)
+    for i in range(count):
+        y, x, at, middle = places[0, i], places[1, i], places[2, i], middles[i]
+        flat = everything if guessed[y, x] else certain
+        odds = ODDS + weight * F32(votes[i])
+        odds += ODDS_PER_LEVEL * F32(differences[i] if inside[i] else np.int32(0))
+        if (odds > 0) != (flat[at] > middle):
+            sharp[y, x], moved[y, x] = _neighbours(flat, at, stride, middle, odds > 0), True
 
 
 @kernel
@@ -154,7 +195,7 @@ def _settle(moved, sharp, guessed, radius, padded, matches, asked):
             asked[y, max(x - 1, 0)] = asked[y, min(x + 1, width - 1)] = True
 
 
-@part
+@inlined_part
 def _listed(row, columns):
     """The number of marked pixels of a row, whose columns are written to `columns`."""
     count = np.int64(0)
@@ -164,7 +205,7 @@ def _listed(row, columns):
     return count
 
 
-@part
+@inlined_part
 def _candidates(flat, at, stride):
     """The smallest and largest disparity of a pixel and its neighbours."""
     low = high = flat[at]
@@ -176,50 +217,65 @@ def _candidates(flat, at, stride):
     return low, high
 
 
-@part
-def _vote(flat, colours, taps, table, at, middle):
-    """Weight of the pixels above the middle disparity minus that of those below it."""
-    own, total = colours[at], np.int32(0)
-    for i in range(taps.size):
-        place = np.uint64(at + taps[i])
-        side = np.int32(flat[place] > middle) - np.int32(flat[place] <= middle)  # 0 of an unknown disparity
-        total += side * table[np.uint64(levels_apart(colours[place], own))]
-    return total
+@inlined_part
+def _add_votes(disparities, colours, middles, own, table, weights, votes, count):
+    """Add the weight of one tap of each pixel, if it is above the middle disparity, or subtract it."""
+    for i in range(count):
+        weights[i] = levels_apart(colours[i], own[i])
+    for i in range(count):
+        weights[i] = table[np.uint64(weights[i])]
+    for i in range(count):
+        side = np.int32(disparities[i] > middles[i]) - np.int32(disparities[i] <= middles[i])  # 0 if it is unknown
+        votes[i] = np.int32(votes[i] + np.int32(side * weights[i]))
 
 
-@part
-def _worse(colours, at, right, window, y, x, low, high):
-    """By how many levels the images around a pixel differ more at the disparity `low` than at `high`, weighted.
+@inlined_part
+def _take_views(colours, at, right, window, y, x, sides, i, views, shares):
+    """Copy what the window shows in the left image, and in the right one at both disparities of pixel i of a batch.
 
-    It is 0 where the window leaves an image. window: for each of its pixels the offsets in `colours` and in `right`,
-    and the weight.
+    Returns whether the window lies inside both images. window: for each of its pixels the offsets in `colours` and in
+    `right`, and the weight.
     """
     height, width = right.shape
-    others, far, near, total = right.reshape(-1), F32(x) - low, F32(x) - high, np.int32(0)
-    i, j = np.int64(np.floor(far)), np.int64(np.floor(near))
-    inside = 1 <= y < height - 1 and REACH <= x < width - REACH and j >= REACH and i + REACH + 1 < width
-    if not inside:
-        return total
-    far_share, near_share = np.uint32((far - F32(i)) * F32(FRACTIONS)), np.uint32((near - F32(j)) * F32(FRACTIONS))
-    i, j = i + y * width, j + y * width
-    for k in range(window.shape[1]):
-        colour = colours[np.uint64(at + window[0, k])]
-        here = _difference(colour, others, i + window[1, k], far_share)
-        total += np.int32(window[2, k]) * (here - _difference(colour, others, j + window[1, k], near_share))
-    return total
+    others, far, near = right.reshape(-1), F32(x) - sides[0, i], F32(x) - sides[1, i]
+    one, two = np.int64(np.floor(far)), np.int64(np.floor(near))
+    inside = 1 <= y < height - 1 and REACH <= x < width - REACH and two >= REACH and one + REACH + 1 < width
+    if inside:
+        shares[0, i], shares[1, i] = (far - F32(one)) * F32(FRACTIONS), (near - F32(two)) * F32(FRACTIONS)
+        one, two = one + y * width, two + y * width
+        for k in range(np.uint64(window.shape[1])):
+            before, here = np.uint64(one + window[1, k]), np.uint64(two + window[1, k])
+            views[k, 0, i] = colours[np.uint64(at + window[0, k])]
+            views[k, 1, i], views[k, 2, i] = others[before], others[before + np.uint64(1)]
+            views[k, 3, i], views[k, 4, i] = others[here], others[here + np.uint64(1)]
+    return inside
 
 
-@part
-def _difference(colour, others, place, share):
+@inlined_part
+def _add_differences(views, far_shares, near_shares, weight, total, count):
+    """Add by how many levels the images differ more at the smaller disparity than at the larger, weighted."""
+    colours, far, farther, near, nearer = views[0], views[1], views[2], views[3], views[4]
+    for i in range(count):
+        more = _difference(colours[i], far[i], farther[i], far_shares[i])
+        less = _difference(colours[i], near[i], nearer[i], near_shares[i])
+        total[i] = np.int32(total[i] + np.int32(weight * np.int32(more - less)))
+
+
+@inlined_part
+def _difference(colour, before, after, share):
     """Levels between a colour and that between two pixels of the right image."""
-    before, after = others[np.uint64(place)], others[np.uint64(place + 1)]
-    rest = np.uint32(FRACTIONS) - share
-    mixed = (((before & RED_BLUE) * rest + (after & RED_BLUE) * share) >> np.uint32(8)) & RED_BLUE
-    mixed |= (((before >> GREEN) & BYTE) * rest + ((after >> GREEN) & BYTE) * share) & (BYTE << GREEN)
-    return min(levels_apart(colour, mixed), np.int32(MAX_DIFFERENCE))
+    rest = np.uint32(np.uint32(FRACTIONS) - share)
+    mixed = np.uint32(_mix(before & RED_BLUE, after & RED_BLUE, rest, share) >> np.uint32(8)) & RED_BLUE
+    green = _mix((before >> GREEN) & BYTE, (after >> GREEN) & BYTE, rest, share) & np.uint32(BYTE << GREEN)
+    return np.int32(min(levels_apart(colour, np.uint32(mixed | green)), np.int32(MAX_DIFFERENCE)))
 
 
-@part
+@inlined_part
+def _mix(before, after, rest, share):
+    return np.uint32(np.uint32(np.uint32(before) * rest) + np.uint32(np.uint32(after) * share))
+
+
+@inlined_part
 def _neighbours(flat, at, stride, middle, above):
     """Mean of the pixel's neighbours on one side of the middle disparity."""
     total, count = F32(0), F32(0)
@@ -273,7 +329,7 @@ def _sharpened_reference(
 
 
 def _worse_reference(left: Array, right: Array, y: int, x: int, candidates: Array) -> int:
-    """`_worse` in plain numpy."""
+    """By how many levels the images around a pixel differ more at the smaller candidate, weighted."""
     (height, width, _), total = left.shape, 0
     places = F32(x) - candidates
     whole = np.floor(places).astype(int)
