@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -28,13 +29,15 @@ def with_rows(whole: Disparity, first: int, part: Disparity) -> Disparity:
     A layer that only one of them has is NaN, -1 (segments) or 255 (costs) in the rows of the other.
     """
     unknown = {"sigma": np.float32(np.nan), "segments": np.int32(-1), "costs": np.uint8(255)}
-    layers = {}
+    layers: dict[str, Any] = {}
+    end = first + len(part.pixels)
     for name in ("pixels", "source", "confidence", *unknown):
         old, new = getattr(whole, name), getattr(part, name)
         if old is None and new is None:
             continue
-        if old is None:
-            old = np.full((*new.shape[:-2], *whole.pixels.shape), unknown[name])
-        layers[name] = old.copy()
-        layers[name][..., first : first + len(part.pixels), :] = unknown[name] if new is None else new
+        like = new if old is None else old
+        layers[name] = np.empty((*like.shape[:-2], *whole.pixels.shape), like.dtype)
+        for rows in (np.s_[..., :first, :], np.s_[..., end:, :]):
+            layers[name][rows] = unknown[name] if old is None else old[rows]
+        layers[name][..., first:end, :] = unknown[name] if new is None else new
     return replace(whole, **layers)

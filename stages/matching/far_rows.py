@@ -9,7 +9,8 @@ import math
 
 import numpy as np
 
-from stages.data import Disparity, PixelOrigin, StereoCamera
+from stages.data import Disparity, StereoCamera
+from stages.matching.kernels.row_ranges import count_in_rows
 
 MAX_FAR_SHARE = 0.1  # of the known pixels of a near row
 MIN_REACHED_SHARE = 0.01  # of all pixels of a row that the map reaches
@@ -24,10 +25,11 @@ def far_rows(prior: Disparity, camera: StereoCamera, max_step: float, max_depth:
     """
     scale, shift = camera.fx * camera.baseline, camera.cx_right - camera.cx  # depth Z = scale / (d + shift)
     # A step of 2 px at depth Z is 2 Z^2 / scale.
-    far = prior.pixels < math.sqrt(2 * scale / max_step) - shift
-    needed = np.count_nonzero(far, axis=1) > MAX_FAR_SHARE * np.count_nonzero(np.isfinite(prior.pixels), axis=1)
+    near = np.float32(math.sqrt(2 * scale / max_step) - shift)
+    reach = np.float32(scale / max_depth - shift if max_depth else -math.inf)
+    far, known, reached = count_in_rows(prior.pixels, prior.source, near, reach)
+    needed = far > MAX_FAR_SHARE * known
     if max_depth:
-        reached = (prior.pixels > scale / max_depth - shift) & (prior.source == PixelOrigin.MEASURED)
-        needed &= np.count_nonzero(reached, axis=1) > MIN_REACHED_SHARE * reached.shape[1]
+        needed &= reached > MIN_REACHED_SHARE * prior.pixels.shape[1]
     rows = np.flatnonzero(needed)
     return (int(rows[0]), int(rows[-1]) + 1) if len(rows) else (0, 0)

@@ -307,8 +307,10 @@ class Match(Stage):
 
 def _copy_nearer(prior: Disparity, search: range, found: Matches) -> None:
     """Copy into `found` the pixels that the prior measures at or beyond the near end of the search range."""
-    copied = np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED)
-    copied &= (prior.pixels > search.stop - RANGE_TOLERANCE) & (prior.pixels < prior.pixels.shape[1])
+    copied = prior.pixels > search.stop - RANGE_TOLERANCE
+    if not copied.any():
+        return
+    copied &= np.isnan(found.pixels) & (prior.source == PixelOrigin.MEASURED) & (prior.pixels < prior.pixels.shape[1])
     for layer, known in zip(found[:3], (prior.pixels, prior.source, prior.confidence), strict=True):
         np.copyto(layer, known, where=copied)
 

@@ -17,8 +17,9 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.compiled.simd import Width
-from stages.data import Array
+from stages.data import Array, PixelOrigin
 
+MEASURED = int(PixelOrigin.MEASURED)
 RANGE_MARGIN = 8  # px to either side of the prior's disparities in a band
 OUTLIER_SHARE = 0.001  # of the prior of a range, at either end, is ignored: less than a speckle
 MIN_KNOWN_SHARE = 0.5  # of a band's pixels; with fewer known pixels, as in the sky, the bands around it count too
@@ -95,6 +96,34 @@ def _count(prior, top, end, minimum, counts):
             place = np.rint(prior[y, x]) - np.float32(minimum)
             if np.isfinite(place):
                 counts[np.int64(min(max(place, np.float32(0)), last))] += 1
+
+
+def count_in_rows(pixels: Array, source: Array, near: np.float32, reach: np.float32) -> Array:
+    """The pixels of each row below `near`, the known ones, and those measured above `reach`: (3, H) int64.
+
+    pixels: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`.
+    """
+    counts = np.zeros((3, len(pixels)), np.int64)
+    _count_in_rows(pixels, source, near, reach, counts)
+    return counts
+
+
+@kernel
+def _count_in_rows(pixels, source, near, reach, counts):
+    for y in range(pixels.shape[0]):
+        far, known, reached = np.int32(0), np.int32(0), np.int32(0)
+        for x in range(np.uint64(pixels.shape[1])):
+            d = pixels[y, x]
+            far += np.int32(d < near)
+            known += np.int32(np.isfinite(d))
+            reached += np.int32((d > reach) & (source[y, x] == MEASURED))
+        counts[0, y], counts[1, y], counts[2, y] = far, known, reached
+
+
+def count_in_rows_reference(pixels: Array, source: Array, near: np.float32, reach: np.float32) -> Array:
+    """`count_in_rows`, in plain numpy."""
+    layers = pixels < near, np.isfinite(pixels), (pixels > reach) & (source == MEASURED)
+    return np.array([np.count_nonzero(layer, axis=1) for layer in layers])
 
 
 @kernel

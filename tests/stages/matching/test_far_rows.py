@@ -8,6 +8,7 @@ import pytest
 from stages import Disparity, Halve, Match, Refine, StereoCamera, StereoFrame, Upsample
 from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.far_rows import far_rows
+from stages.matching.kernels.row_ranges import count_in_rows, count_in_rows_reference
 
 CAMERA = StereoCamera(fx=200, fy=200, cx=60, cy=48, baseline=0.2, width=120, height=96, cx_right=61)
 SCALE = CAMERA.fx * CAMERA.baseline
@@ -46,6 +47,14 @@ def test_specks_and_guesses_move_no_limit_and_a_far_corner_does():
     pixels[90, :40] = 3
     assert far_rows(disparity(pixels), CAMERA, 0.1, 0.0) == (0, 91)
     assert far_rows(disparity(ground(), source=3), CAMERA, 0.1, 8.0) == (0, 0)  # filled
+
+
+def test_counts_of_rows_equal_the_reference():
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(-2, 12, (9, 37)).astype(np.float32)
+    pixels[rng.random(pixels.shape) < 0.2], pixels[4, 4], source = np.nan, np.inf, rng.integers(0, 4, pixels.shape)
+    given = pixels, source.astype(np.uint8), np.float32(7), np.float32(3)
+    np.testing.assert_array_equal(count_in_rows(*given), count_in_rows_reference(*given))
 
 
 @pytest.mark.parametrize("pixels", [ground(1.0), ground(100, 50), np.full((96, 120), np.nan)],
