@@ -184,7 +184,8 @@ def why(
     if place is None:
         raise UsageError(f"({x:g}, {y:g}) is outside the map, which has {_extent(navigation)}")
     x, y = centre_of(navigation, place)
-    inside = _members(cloud, navigation, *place)
+    cells = np.floor((cloud.points[:, :2] - np.array(navigation.origin)) / navigation.resolution)
+    inside = (cells == place[::-1]).all(axis=1)
     frame, origin = _last(items, StereoFrame), np.zeros(3) if cloud.sensor is None else cloud.sensor.translation
     return Explanation(
         **verdict_at(node.actor, navigation, terrain, place),
@@ -312,12 +313,6 @@ def _extent(navigation: NavigationMap) -> str:
     rows, cols = navigation.cells.shape
     (x, y), step = navigation.origin, navigation.resolution
     return f"x {x:.2f} to {x + cols * step:.2f} m, y {y:.2f} to {y + rows * step:.2f} m in '{navigation.frame_id}'"
-
-
-def _members(cloud: PointCloud, navigation: NavigationMap, row: int, col: int) -> Array:
-    """Which points (N,) bool lie in a cell."""
-    cells = np.floor((cloud.points[:, :2] - np.array(navigation.origin)) / navigation.resolution)
-    return np.asarray((cells[:, 0] == col) & (cells[:, 1] == row))
 
 
 def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> Cell | None:

@@ -99,7 +99,9 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
 
 def _verdict(rows: list[dict[str, object]], folder: Path) -> int:
     """Print how many logs ended how."""
-    ended = [str(row["verdict"] if row["state"] == "done" else row["state"]) for row in rows]
+    from flow.cli.fleet.catalogue import outcome
+
+    ended = [outcome(row) for row in rows]
     say(
         ", ".join(f"{ended.count(name)} {name}" for name in dict.fromkeys(sorted(ended)))
         + f"; roverflow list {folder} lists them"

@@ -74,12 +74,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the traverse."""
     check_outputs({"input log": options.out})
-    given = {option: getattr(options, option) for option in OPTIONS}
-    settings = {}
-    for option, value in given.items():
-        field, kind, unit, *_ = OPTIONS[option]
-        if value is not None:
-            settings[field] = value * unit if kind is float else value
+    settings = {
+        field: value * unit if kind is float else value
+        for option, (field, kind, unit, *_) in OPTIONS.items()
+        if (value := getattr(options, option)) is not None
+    }
     width, height = options.size
     try:
         simulate(options.out, **settings, width=width, height=height)

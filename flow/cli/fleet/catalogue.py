@@ -133,6 +133,11 @@ class Catalogue:
             database.close()
 
 
+def outcome(row: Mapping[str, Any]) -> str:
+    """How a log ended: the verdict of its run, or the state of one that has none."""
+    return str(row["verdict"] if row["state"] == "done" else row["state"])
+
+
 def as_table(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
     """Rows as an aligned text table."""
     names = list(columns)

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flow.cli.fleet.catalogue import NAME, Catalogue
+from flow.cli.fleet.catalogue import NAME, Catalogue, outcome
 from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.reporting.page import html_table, write_page
@@ -22,7 +22,7 @@ _COLUMNS = ("name", "verdict", "frames", "findings", "seconds", "why")
 def write_fleet_page(path: Path, folder: Path) -> None:
     """Write the page of a fleet's folder: verdicts, times, losses and findings of every log."""
     rows = Catalogue(folder).rows(sort="verdict = 'COMPLETE', state, name")
-    ended = Counter(str(row["verdict"] if row["state"] == "done" else row["state"]) for row in rows)
+    ended = Counter(map(outcome, rows))
     hours = sum(row["seconds"] or 0.0 for row in rows) / 3600
     gigabytes = sum(row["bytes"] or 0 for row in rows) / 1e9
     facts = [(name, str(number)) for name, number in ended.items()]
@@ -60,7 +60,7 @@ def score_rows(scores: Mapping[str, Score]) -> list[tuple[str, ...]]:
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
     if column == "verdict":
-        return str(row["verdict"] if row["state"] == "done" else row["state"])
+        return outcome(row)
     if column == "frames":
         return "" if row["frames"] is None else f"{row['complete']} of {row['frames']}"
     value = row[column]
