@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import inlined_part, kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
@@ -35,16 +35,28 @@ def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
 @kernel
 def _double(small, large, first, end):
     rows, columns = small.shape
+    width, last = large.shape[1], columns - 1
     for y in range(first, end):
-        row, beside = y >> 1, min(max((y >> 1) + (y & 1) * 2 - 1, 0), rows - 1)
-        for x in range(large.shape[1]):
-            col, next_col = x >> 1, min(max((x >> 1) + (x & 1) * 2 - 1, 0), columns - 1)
-            nearest = small[row, col]
-            # Pixel centres are whole numbers: a quarter of the way to the neighbour on this side.
-            along = F32(0.75) * nearest + F32(0.25) * small[row, next_col]
-            other = F32(0.75) * small[beside, col] + F32(0.25) * small[beside, next_col]
-            smooth = F32(0.75) * along + F32(0.25) * other
-            large[y, x] = F32(2) * (smooth if abs(smooth - nearest) < F32(MAX_STEP) else nearest)
+        row, beside = small[y >> 1], small[min(max((y >> 1) + (y & 1) * 2 - 1, 0), rows - 1)]
+        target = large[y]
+        for col in range(np.uint64(1), np.uint64(max(last, 1))):  # without sign: numba looks for no negative index
+            target[col + col] = _between(row, beside, col, col - np.uint64(1))
+            target[col + col + np.uint64(1)] = _between(row, beside, col, col + np.uint64(1))
+        target[0] = _between(row, beside, 0, 0)
+        if width > 1:
+            target[1] = _between(row, beside, 0, min(1, last))
+            target[2 * last] = _between(row, beside, last, max(last - 1, 0))
+            if 2 * last + 1 < width:
+                target[2 * last + 1] = _between(row, beside, last, last)
+
+
+@inlined_part
+def _between(row, beside, col, next_col):
+    """Twice the disparity a quarter of the way from a pixel to its neighbours, as pixel centres are whole numbers."""
+    nearest = row[col]
+    along = F32(0.75) * nearest + F32(0.25) * row[next_col]
+    smooth = F32(0.75) * along + F32(0.25) * (F32(0.75) * beside[col] + F32(0.25) * beside[next_col])
+    return F32(2) * (smooth if abs(smooth - nearest) < F32(MAX_STEP) else nearest)
 
 
 def doubled_reference(small: Array, height: int, width: int) -> Array:
