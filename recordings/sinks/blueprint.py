@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,7 @@ class Layout:
 
     def as_json(self) -> str:
         """The text that a recording keeps."""
-        views = [[spec.panel.name, *astuple(spec)[1:]] for spec in self.views]
+        views = [[spec.panel.name, *[*vars(spec).values()][1:]] for spec in self.views]
         return json.dumps({"application_id": self.application_id, "slowest": self.slowest, "views": views})
 
 

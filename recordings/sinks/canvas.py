@@ -260,8 +260,7 @@ class Canvas:
         path = view.path
         if self._legends.get(path) != legend:
             self._legends[path] = legend
-            names = [rr.AnnotationInfo(id=code & 0xFF, label=name, color=rgb) for code, (name, rgb) in legend.items()]
-            self.recording.log(path, rr.AnnotationContext(names), static=True)
+            self.recording.log(path, _annotations(tuple(legend.items())), static=True)
         labels = codes.astype(np.uint8, copy=False)
         self._log_raw(f"{path}/labels", rr.SegmentationImage, labels)
         self.add_view(view)
@@ -338,6 +337,12 @@ def _lens(focal: Sides, centre: Sides, size: tuple[int, int]) -> tuple[Component
         camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.7,
     )  # fmt: skip
     return components_of(lens)
+
+
+@lru_cache(maxsize=16)
+def _annotations(legend: tuple[tuple[int, tuple[str, Rgb]], ...]) -> rr.AnnotationContext:
+    """The names and the colours of labels."""
+    return rr.AnnotationContext([rr.AnnotationInfo(code & 0xFF, name, rgb) for code, (name, rgb) in legend])
 
 
 @lru_cache(maxsize=256)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import cache, lru_cache
+from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -183,11 +184,12 @@ def blob(kind: Any, field: str, content: bytes | Array) -> Component:
 
 def _listed(contents: Sequence[Any]) -> pa.ListArray:
     """What many rows have of a component: nothing where it is cleared, null where a row leaves it out."""
+    present = [content for content in contents if content is not None]
+    blobs = [content for content in present if isinstance(content, Blob)]
+    values = _joined(blobs) if blobs else pa.concat_arrays(present)
     lengths = [0 if content is None else 1 if isinstance(content, Blob) else len(content) for content in contents]
-    blobs = [content for content in contents if isinstance(content, Blob)]
-    values = _joined(blobs) if blobs else pa.concat_arrays([content for content in contents if content is not None])
-    missing = pa.array([content is None for content in contents])
-    return pa.ListArray.from_arrays(_ends(lengths), values, mask=missing if missing.true_count else None)
+    missing = pa.array([content is None for content in contents]) if len(present) < len(contents) else None
+    return pa.ListArray.from_arrays(_ends(lengths), values, mask=missing)
 
 
 def _joined(blobs: Sequence[Blob]) -> pa.ListArray:
@@ -199,4 +201,4 @@ def _joined(blobs: Sequence[Blob]) -> pa.ListArray:
 
 def _ends(lengths: Sequence[int]) -> pa.Array:
     """The places at which lists of these lengths begin, and the end."""
-    return pa.array(np.cumsum([0, *lengths], dtype=np.int32))
+    return pa.array(list(accumulate(lengths, initial=0)), pa.int32())

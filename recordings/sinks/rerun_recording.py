@@ -135,7 +135,8 @@ class RerunRecording:
             self._canvas.clear_missing()
             self._note(record, "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions]))
             self._log_losses(record.entries, self._frames)
-            self._send_blueprint()
+            if self._frames or self._viewer is not None:  # a run of one frame sends it at its end only
+                self._send_blueprint()
             if self._viewer is not None:
                 self._canvas.rows.send()
                 self._recording.flush()  # a viewer shows each frame at once
