@@ -163,6 +163,11 @@ def cell_stride(elevation: Array, max_cells: int) -> int:
     return math.ceil(math.sqrt(max(1.0, int(np.count_nonzero(np.isfinite(elevation))) / max_cells)))
 
 
+def fewer_shades(rgb: Array) -> Array:
+    """Colours (..., 3) in steps of 8 of each channel, which take half the room of exact ones."""
+    return np.asarray(np.minimum(rgb, 251) + np.uint8(4) & np.uint8(0xF8))
+
+
 def every_nth_cell(terrain: ElevationMap, step: int) -> ElevationMap:
     """The terrain at every n-th row and column."""
     if step == 1:

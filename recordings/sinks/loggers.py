@@ -38,7 +38,7 @@ from stages.data.rotations import matrix_of
 
 # Steps of drawn values: to a px of disparity, to a px of sigma, to a metre of depth; the result log has more digits
 DISPARITY_STEPS, SIGMA_STEPS, DEPTH_STEPS = 4, 250, 250
-POINT_STEPS = 512  # to a metre; a power of 2, so that the lower bits of the drawn points are 0
+POINT_STEPS = 256  # to a metre, of points and heights; a power of 2, so that their lower bits are 0
 ALL_CODES = np.arange(256, dtype=np.uint8)
 # Layer -> the upper end of its scale, twice the usual limit, and its unit
 LAYER_SCALES = {
@@ -187,7 +187,8 @@ def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
         if canvas.pictures:
             some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
             places = np.rint(POINT_STEPS * cloud.points[some]) / np.float32(POINT_STEPS)
-            points = drawn(rr.Points3D, positions=places, colors=cloud.colors[some], radii=rr.Radius.ui_points(2.0))
+            colors = colormaps.fewer_shades(cloud.colors[some])
+            points = drawn(rr.Points3D, positions=places, colors=colors, radii=rr.Radius.ui_points(2.0))
             view = ViewSpec(Panel.CLOUD, stream, "points", stream, cloud.frame_id)
             canvas.log(view.path, points, view)
         # An optical axis (z) below the horizon is pitch down; the image's right side (x) below it is roll right.
@@ -204,9 +205,9 @@ def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
         return caption
     some = slice(None, None, max(1, -(-len(voxels.index) // canvas.max_points)))
     centres = (voxels.index[some] + np.float32(0.5)) * np.float32(voxels.resolution)
-    half_sizes = np.full_like(centres, voxels.resolution / 2)
-    boxes = drawn(rr.Boxes3D, centers=centres, half_sizes=half_sizes, colors=voxels.colors[some],
-                  fill_mode=rr.components.FillMode.Solid)  # fmt: skip
+    colors = colormaps.fewer_shades(voxels.colors[some])
+    shape = {"centers": centres, "half_sizes": np.full_like(centres, voxels.resolution / 2), "colors": colors}
+    boxes = drawn(rr.Boxes3D, **shape, fill_mode=rr.components.FillMode.Solid)
     view = ViewSpec(Panel.VOXELS, stream, "voxels", stream, voxels.frame_id)
     canvas.log(view.path, boxes, view)
     return caption
@@ -263,23 +264,24 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     terrain = colormaps.terrain_ahead(terrain)
     elevation, suffix = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
     low, high = canvas.limits(stream, *colormaps.elevation_limits(elevation))
-    rgb = colormaps.elevation_colors(terrain, (low, high))
+    rgb, known = colormaps.elevation_colors(terrain, (low, high)), np.isfinite(elevation)
+    rgb = np.where(known[..., None], colormaps.fewer_shades(rgb), rgb)
     relief = ViewSpec(Panel.RELIEF, stream, "relief", f"relief{suffix}")
     canvas.log_exact(relief.path, colormaps.birds_eye(rgb), relief)
     canvas.log_scale(f"{relief.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
     canvas.log_distances(f"{relief.path}/lines", terrain.shape, terrain)
-    caption = f"{stream} {counted(int(np.count_nonzero(np.isfinite(elevation))), 'cell')}"
+    caption = f"{stream} {counted(int(np.count_nonzero(known)), 'cell')}"
     if not canvas.pictures:
         return caption
     step = colormaps.cell_stride(elevation, MAX_CELLS)
     coarse = colormaps.every_nth_cell(terrain, step)
     _log_layers(canvas, stream, coarse, (low, high))
     vertices, triangles = colormaps.surface(coarse)
+    vertices[:, 2] = np.rint(POINT_STEPS * vertices[:, 2]) / np.float32(POINT_STEPS)
     if len(triangles):
         colors = rgb[step // 2 :: step, step // 2 :: step][np.isfinite(coarse.layers["elevation"])]
         mesh = drawn(rr.Mesh3D, vertex_positions=vertices, triangle_indices=triangles, vertex_colors=colors)
-        view = ViewSpec(Panel.TERRAIN, stream, "surface", stream, terrain.frame_id)
-        canvas.log(view.path, mesh, view)
+        canvas.log(f"{stream}/surface", mesh, ViewSpec(Panel.TERRAIN, stream, "surface", stream, terrain.frame_id))
     return caption
 
 

@@ -319,7 +319,7 @@ def test_a_budget_thins_images_more_and_more_and_is_kept(tmp_path):
         of = {"colors": np.zeros((10_000, 3), np.uint8), "sigma": np.ones(10_000, np.float32)}
         items["points"] = replace(items["points"], points=points, pixel=np.zeros(10_000, np.int32), **of)
         records.append(Record(items["points"].stamp, items))
-    path = record_of(tmp_path / "budget.rrd", records, max_megabytes=2)
+    path = record_of(tmp_path / "budget.rrd", records, max_megabytes=2, max_points=10_000)
     clouds = [frame for _, frame, value in rows(path, "/points/points", "Points3D:positions") if value]
     gaps = np.diff(clouds)
     assert gaps[0] == 1
