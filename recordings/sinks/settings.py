@@ -18,7 +18,7 @@ class RecordingSettings(Checked):
     max_points: int = parameter(8_000, "most points drawn of a cloud", low=1)
     max_width: int = parameter(
         0, "widest picture; an intermediate has three eighths of it. 0: half as wide as the camera's images, but 320 "
-        "to 640 px, and intermediates 160 to 240 px",
+        "to 640 px, and intermediates 120 to 240 px",
         low=0, unit="px",
     )  # fmt: skip
     jpeg_quality: int = parameter(75, "of the camera images", low=1, high=100)
