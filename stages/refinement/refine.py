@@ -19,6 +19,7 @@ from stages.matching.image_noise import frame_noise
 from stages.matching.intensity import alike, eight_bit, gray_pair
 from stages.matching.kernels.texture import contrast, slopes
 from stages.refinement.kernels.bilateral import joint_bilateral
+from stages.refinement.kernels.bridges import bridge_holes
 from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.refinement.kernels.label_origin import Trust, label_origin
@@ -104,6 +105,10 @@ class Refine(Stage):
     max_extrapolation: int = parameter(
         16, "how far holes are filled beyond the last match, at the border or towards the sky", unit="px", low=0
     )
+    bridge: bool = parameter(
+        True, "whether a hole that both cameras see takes a line between its ends, where the images contradict its "
+        "filling; ground has flanks, rooms have steps",
+    )  # fmt: skip
     bilateral_radius: int = parameter(
         3, "radius and spatial sigma of the bilateral filter; 0: none", unit="px", low=0, high=32
     )
@@ -147,7 +152,7 @@ class Refine(Stage):
         smoothed = self._median(matches)
         within = extent(smoothed, self.threads)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
-        filled, kinds = self._filled(planar, within, image)
+        filled, kinds = self._filled(planar, within, image, guide, right)
         sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, *alike(image, other))
         refined, sigma, consistent = self._supported(sharp, kinds != KEPT, frame)
         source, confidence = label_origin(
@@ -210,11 +215,12 @@ class Refine(Stage):
         supported = (planes.inlier_share >= MIN_INLIER_SHARE) & (planes.valid_share >= valid_share)
         return np.where((supported & (slope <= MAX_GRADIENT * spacing))[:, None], planes.coefficients, np.nan)
 
-    def _filled(self, pixels: Array, within: Extent, image: Array) -> tuple[Array, Array]:
+    def _filled(self, pixels: Array, within: Extent, image: Array, guide: Array, right: Array) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
-        if self.fill:
-            return fill_holes(pixels, image, within, self.max_fill_distance, self.max_extrapolation, self.threads)
-        return pixels, np.where(np.isnan(pixels), np.uint8(OCCLUSION), np.uint8(KEPT))
+        if not self.fill:
+            return pixels, np.where(np.isnan(pixels), np.uint8(OCCLUSION), np.uint8(KEPT))
+        found = fill_holes(pixels, image, within, self.max_fill_distance, self.max_extrapolation, self.threads)
+        return bridge_holes(pixels, *found, guide, right, self.threads) if self.bridge else found
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
