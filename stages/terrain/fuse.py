@@ -117,8 +117,8 @@ class _Fusion(Stage):
         apart = math.inf if logged is None else math.dist(level.translation[:2], logged.translation[:2])
         if logged is None or cloud.stamp != state.last or apart > self.resolution:
             raise StageError(
-                f"Fuse: the frame of {state.last} ns, the last one in the map of the log, has no cloud, or its pose is "
-                "more than a cell off its place there"
+                f"{type(self).__name__}: the frame of {state.last} ns, the last one in the map of the log, has no "
+                "cloud, or its pose is more than a cell off its place there"
             )
         plane, sigma = plane_between(level, logged), cloud.tilt_sigma or self.tilt_sigma
         levelling = MapLevelling.begin(pose, self._stated).tilted(up, sigma).placed()
@@ -146,9 +146,13 @@ class _Fusion(Stage):
     def _check(self, cloud: PointCloud, state: FusedMap) -> None:
         check_level(self, cloud)
         if cloud.sensor is None:
-            raise StageError("Fuse: the cloud lacks its camera's place, `sensor`; stages.Level adds it")
+            raise StageError(
+                f"{type(self).__name__}: the cloud lacks its camera's place, `sensor`; stages.Level adds it"
+            )
         if cloud.stamp <= state.last and state.logged is None:
-            raise StageError(f"Fuse: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns")
+            raise StageError(
+                f"{type(self).__name__}: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns"
+            )
 
     def _observation(self, frame: FrameGrid) -> Observation:
         """The known cells of a frame; the errors of its position are added to their variance."""
@@ -223,8 +227,9 @@ class _Fusion(Stage):
         state.rejected += 1
         if state.rejected < MAX_REJECTED:
             raise StageError(
-                f"Fuse: the frame lies {change[0]:.2f} m and {np.degrees(change[1:].max()):.1f} degrees off the map, "
-                "unlike the frames before; its pose or its tilt has jumped, and it is left out of the regional map"
+                f"{type(self).__name__}: the frame lies {change[0]:.2f} m and {np.degrees(change[1:].max()):.1f} "
+                "degrees off the map, unlike the frames before; its pose or its tilt has jumped, and it is left out of "
+                "the regional map"
             )
         return True
 
