@@ -275,13 +275,13 @@ def print_worth(cases: list[Case]) -> None:
 
 def print_table(title: str, means: dict[str, Array], released: Array | None) -> None:
     """Print the errors in percent (RMS in px); with `released` also their ratios to the released code's."""
-    print(f"\n{title:32} {COLUMNS}  known %  bad-1 at edges  elsewhere")
+    print(f"\n{title:34} {COLUMNS}  known %  bad-1 at edges  elsewhere")
     for name, mean in means.items():
-        print(f"{name:32}{row('', mean[:8])[12:]} {mean[8]:15.2f} {mean[9]:10.2f}")
+        print(f"{name:34}{row('', mean[:8])[12:]} {mean[8]:15.2f} {mean[9]:10.2f}")
     if released is not None:
-        print(f"\n{'over the released code':32} {COLUMNS}")
+        print(f"\n{'over the released code':34} {COLUMNS}")
         for name, mean in means.items():
-            print(f"{name:32}{row('', mean[:7] / released, 3)[12:]}")
+            print(f"{name:34}{row('', mean[:7] / released, 3)[12:]}")
 
 
 def pictures(folder: Path, name: str, frame: StereoFrame, disparity: Disparity) -> None:
