@@ -17,9 +17,9 @@ from stages.refinement.kernels.holes import KEPT, MIN_SURFACE_STEP, MISMATCH, OC
 
 F32 = np.float32
 MIN_LENGTH = 4  # px, of a hole; in a shorter one the images decide little
-MIN_SEEN_LENGTH = 1.0  # px, of a hole in the right image
+MIN_SEEN_LENGTH = 2.0  # px, of a hole in the right image; matches end a little before the edge of what is hidden
 MIN_CHANGE = 1.0  # px between the line and the background
-MIN_CONTRADICTION = 4  # mean gray levels between the images, well above noise
+MIN_CONTRADICTION = 6  # mean gray levels between the images, well above noise
 MAX_DIFFERENCE = 20  # gray levels; a pixel that differs more counts no more
 RADIUS = 1  # rows above and below whose images count
 PARTS = 16  # of a pixel; whole numbers sum to the same in any order
