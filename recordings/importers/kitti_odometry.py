@@ -70,7 +70,7 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
 
 
 def existing(listed: list[ImagePair], file: str, notes: list[str]) -> list[ImagePair]:
-    """The pairs of which both images exist; a note about the others, which `file` lists."""
+    """The pairs that have both images. A note counts the others that `file` lists."""
     pairs = [pair for pair in listed if pair.left.exists() and pair.right.exists()]
     if len(pairs) < len(listed):
         notes.append(f"{file} lists {counted(len(listed) - len(pairs), 'pair')} without one of the images")

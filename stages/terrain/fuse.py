@@ -91,7 +91,7 @@ class _Fusion(Stage):
     def _fused(self, cloud: PointCloud, pose: Pose, mount: Mount | None, state: FusedMap) -> Region:
         """The region in the pose's frame, with a cloud in frame `level` merged in."""
         self._check(cloud, state)
-        level, up = register(cloud, pose, mount)
+        level, up = register(self, cloud, pose, mount)
         if state.logged is not None and pose.frame_id == state.frame_id:
             return self._placed(cloud, level, up, pose, state)
         frame = frame_grid(cloud, level, self.resolution, self.max_range)

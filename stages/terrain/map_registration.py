@@ -15,6 +15,7 @@ from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Mount, PointCloud, Pose, Transform
 from stages.data.arrays import Span, spanned
 from stages.data.rotations import quaternion_of, turn_about_z, turn_by
+from stages.stage import Stage
 from stages.terrain.dem import Voxelise
 
 # Between z of the pose's frame and up. Odometry without an inclinometer may differ by the slope of the ground.
@@ -55,21 +56,21 @@ class FrameGrid:
         return x - self.level.translation[0], y - self.level.translation[1]
 
 
-def register(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple[Transform, Array]:
+def register(stage: Stage, cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple[Transform, Array]:
     """Frame `level` of a levelled cloud in the pose's frame, upright with the pose's heading; and up (3,) by the tilt.
 
     Roll and pitch of the pose are not used. Raises StageError if the transform from the pose's child frame to the
     camera is unknown, or if z of the pose's frame is not up.
     """
     assert cloud.sensor is not None
-    child = _child_from_camera(pose, cloud.sensor, mount)
+    child = _child_from_camera(stage, pose, cloud.sensor, mount)
     camera = pose.transform.rotation @ child.rotation
     turned = camera @ cloud.sensor.rotation.T
     lean = float(np.arccos(np.clip(turned[2, 2], -1.0, 1.0)))
     if lean > _MAX_LEAN:
         raise StageError(
-            f"Fuse: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off the vertical of the "
-            "tilt; check the tilt, or give a pose in a frame whose z points up"
+            f"{type(stage).__name__}: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off "
+            "the vertical of the tilt; check the tilt, or give a pose in a frame whose z points up"
         )
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     rotation = turn_about_z(yaw)
@@ -77,13 +78,13 @@ def register(cloud: PointCloud, pose: Pose, mount: Mount | None = None) -> tuple
     return Transform(pose.frame_id, LEVEL_FRAME, rotation, pose.position - rotation @ origin), turned[:, 2]
 
 
-def _child_from_camera(pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
+def _child_from_camera(stage: Stage, pose: Pose, sensor: Transform, mount: Mount | None) -> Transform:
     """The camera in the pose's child frame."""
     camera = (mount or Mount(0, np.eye(3))).camera_in(pose.child_frame_id, sensor.child)
     if camera is None:
         raise StageError(
-            f"Fuse: the pose is of '{pose.child_frame_id}', and no transform links it to the camera '{sensor.child}'; "
-            "record its static transform, or set base_frame of the source"
+            f"{type(stage).__name__}: the pose is of '{pose.child_frame_id}', and no transform links it to the camera "
+            f"'{sensor.child}'; record its static transform, or set base_frame of the source"
         )
     return camera
 

@@ -81,7 +81,9 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance(monkeypatch):
     ]
     clouds[1] = (clouds[1][0], replace(clouds[1][1], position=[0, 0, 0]))
     clouds[1] = (replace(clouds[1][0], points=clouds[1][0].points + np.float32([0, 0, 0.01])), clouds[1][1])
-    local = [frame_grid(cloud, register(cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds]
+    local = [
+        frame_grid(cloud, register(Fuse(), cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds
+    ]
     for cloud, pose in clouds:
         terrain = fuse(cloud, pose, MOUNT)
     one, other = (layers["variance"].astype(float) + fuse.alignment_sigma**2 for layers in local)

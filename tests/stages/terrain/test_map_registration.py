@@ -28,7 +28,10 @@ def test_frames_with_tilt_errors_join_without_a_seam():
     rng, fuse, seams, before = np.random.default_rng(3), Running(Fuse()), [], None
     for frame in range(12):
         cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
-        now = [heights(cloud, placed) for placed in (register(cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)]
+        now = [
+            heights(cloud, placed)
+            for placed in (register(Fuse(), cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)
+        ]
         if before is not None:
             off = [one - other for one, other in zip(before, now, strict=True)]
             seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
@@ -100,7 +103,7 @@ def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
     tilted = Rotation.from_quat(pose.quaternion) * Rotation.from_euler("yx", [8, -5], degrees=True)
     level = Transform("level", "base_link", Rotation.from_euler("yx", [8, -5], degrees=True).as_matrix(), np.zeros(3))
     cloud = replace(cloud, sensor=level.after(MOUNT.base_from_camera))
-    placed, _ = register(cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
+    placed, _ = register(Fuse(), cloud, replace(pose, quaternion=tilted.as_quat()), MOUNT)
     np.testing.assert_allclose(placed.rotation, Rotation.from_quat(pose.quaternion).as_matrix(), atol=1e-9)
     np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
 
