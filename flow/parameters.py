@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, field, fields, is_dataclass
-from types import UnionType
-from typing import Any, Union, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin
 
 from flow.units import as_written, check_bare, quantity
+
+_WORDS = {str: "a text", bool: "true or false", list: "a list", dict: "a mapping", Mapping: "a mapping"}
 
 
 def parameter(
@@ -98,28 +100,35 @@ def _is_finite(value: Any) -> bool:
 
 def coerced(value: Any, kind: Any, known: Field[Any]) -> Any:
     """A value of a pipeline file as the parameter `known` of type `kind`. Raises ValueError where it is none."""
-    if get_origin(kind) in (Union, UnionType):
-        options = get_args(kind)
-        if value is None and type(None) in options:
-            return None
-        return coerced(value, _option(value, options), known)
-    if get_origin(kind) is tuple:
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin in (Union, UnionType):
+        return None if value is None and NoneType in parts else coerced(value, _option(value, parts), known)
+    if origin is Literal and value not in parts:
+        raise ValueError(f"must be one of {', '.join(map(str, parts))}, not {value!r}")
+    if origin in (tuple, list, Sequence):
         if not isinstance(value, list):
             raise ValueError(f"expected a list, not {value!r}")
-        return tuple(coerced(item, get_args(kind)[0], known) for item in value)
-    if get_origin(kind) is not None or kind is Any:
+        kinds = parts if origin is tuple and parts[-1] is not Ellipsis else parts[:1] * len(value)
+        if len(value) != len(kinds):
+            raise ValueError(f"expected {len(kinds)} values, not {value!r}")
+        items = [coerced(item, part, known) for item, part in zip(value, kinds, strict=True)]
+        return items if origin is list else tuple(items)
+    if origin in (dict, Mapping) and isinstance(value, dict):
+        return {key: coerced(item, parts[1], known) for key, item in value.items()}
+    if origin not in (None, dict, Mapping) or kind is Any:
         return value
     if kind in (int, float):
         return _number(value, kind, known)
-    if not isinstance(value, kind):
-        raise ValueError(f"expected {kind.__name__}, not {value!r}")
+    plain = origin or kind
+    if not isinstance(value, plain):
+        raise ValueError(f"expected {_WORDS.get(plain, plain.__name__)}, not {value!r}")
     check(value, known)
     return value
 
 
 def _option(value: Any, options: Sequence[Any]) -> Any:
     """The type of a union to read a value as: a list as the tuple, anything else as the type that is no tuple."""
-    options = [option for option in options if option is not type(None)]
+    options = [option for option in options if option is not NoneType]
     fitting = [option for option in options if (get_origin(option) is tuple) == isinstance(value, list)]
     return (fitting or options)[0]
 

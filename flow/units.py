@@ -51,8 +51,8 @@ def quantity(text: str, unit: str) -> float:
         raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {', '.join(known)}")
     kind, size = UNITS[given]
     if kind != wanted:
-        usual = _WRITTEN.get(wanted, ())
-        units = f" in {unit if unit in usual else ' or '.join(usual)}" if usual else f", such as {match[1]} {unit}"
+        usual = " or ".join(_WRITTEN.get(wanted, ()))
+        units = f" in {usual}" if usual else f", such as {match[1]} {unit}"
         plain = f"a plain number such as {number * size:.9g}" if kind == "share" else "a plain number"
         raise ValueError(f"'{text}' is {_a(kind)}; expected {f'{_a(wanted)}{units}' if unit else plain}")
     if given == unit or number == 0 or not math.isfinite(number):

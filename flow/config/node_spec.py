@@ -132,7 +132,8 @@ def class_at(use: str, place: YamlLocation) -> type:
             raise place.error(f"{use} has parameters, but is no dataclass; decorate it with @dataclass{frozen}")
         return kind
     if hasattr(module, name):
-        raise place.error(f"{use} is no dataclass; decorate it with @dataclass")
+        remedy = "decorate it with @dataclass" if isinstance(kind, type) else "a stage is a class with __call__"
+        raise place.error(f"{use} is no dataclass; {remedy}")
     listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
     known = [n for n in listed if is_dataclass(getattr(module, n, None))]
     raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known)}")

@@ -7,9 +7,10 @@ stages and sinks of a graph share one clock; aligners join the others.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
 from inspect import Parameter, signature
+from itertools import repeat
 from numbers import Real
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
@@ -75,12 +76,12 @@ class Node:
     @property
     def own(self) -> bool:
         """Whether the stage is a user's own, not one of the product."""
-        return type(self.actor).__module__.partition(".")[0] != "stages"
+        return _is_own(type(self.actor))
 
     def check(self, value: Any, given: Iterable[Any], stamp: int) -> None:
         """Refuse a result of another type, or with a stamp of neither the frame nor an input. A flush may be older."""
-        if not is_item(value, self.output):
-            raise TypeError(f"{self.use} returned {type(value).__name__}, not {self.output.__name__}")
+        if why := misfit(value, self.output):
+            raise TypeError(f"{self.use} returned {why}")
         stamps = {stamp, None, *(getattr(item, "stamp", None) for item in given)}
         if getattr(value, "stamp", None) not in stamps and not hasattr(self.actor, "flush"):
             raise StageError(f"{self.use} returned the stamp {value.stamp} ns, not that of its frame")
@@ -248,13 +249,49 @@ def accepts(wanted: Any, given: type) -> bool:
     return wanted is Any or (isinstance(wanted, type) and issubclass(given, wanted))
 
 
-def is_item(value: Any, kind: Any) -> bool:
-    """Whether a stage that is annotated to return `kind` may return this value; a number of numpy is a number."""
-    plain = get_origin(kind) or kind
+def misfit(value: Any, kind: Any) -> str:
+    """Why a stage that is annotated to return `kind` may not return this value: "str, not float"; empty where it may.
+
+    A number of numpy is a number. The numbers of an array may be of another size, but not of another kind.
+    """
+    if _is_union(kind):
+        found = [misfit(value, option) for option in get_args(kind)]
+        return found[0] if all(found) else ""
+    plain, parts = get_origin(kind) or kind, get_args(kind)
+    if plain is Any or not isinstance(plain, type):
+        return ""
     number = {bool: "b", int: "iu", float: "fiu"}.get(plain, "")
     if number and getattr(value, "shape", None) == ():
-        return value.dtype.kind in number
-    return isinstance(value, Real if plain is float else plain)
+        fits = value.dtype.kind in number
+    else:
+        fits = isinstance(value, Real if plain is float else plain)
+    if not fits:
+        return f"{type(value).__name__}, not {plain.__name__}"
+    for name, item, wanted in _contents(value, parts):
+        if why := misfit(item, wanted):
+            return f"{why}, as {name!r}"
+    for wanted in (scalar for part in parts[1:] for scalar in get_args(part) if hasattr(value, "dtype")):
+        given = value.dtype.type
+        if isinstance(wanted, type) and not issubclass(given, (wanted, wanted.__mro__[1])):
+            return f"an array of {given.__name__}, not of {wanted.__name__}"
+    return ""
+
+
+def _contents(value: Any, parts: tuple[Any, ...]) -> Iterator[tuple[Any, Any, Any]]:
+    """Name, item and annotated type of what is in a value; a field may be None. parts: the arguments of its type."""
+    if is_dataclass(value) and _is_own(type(value)):
+        fields = ((name, getattr(value, name), kind) for name, kind in hints_of(type(value)).items())
+        yield from (field for field in fields if field[1] is not None)
+    elif isinstance(value, Mapping) and parts:
+        yield from ((name, item, parts[1]) for name, item in value.items())
+    elif isinstance(value, list | tuple) and parts:
+        kinds = repeat(parts[0]) if isinstance(value, list) or parts[-1] is Ellipsis else parts
+        yield from ((number, item, kind) for number, (item, kind) in enumerate(zip(value, kinds, strict=False)))
+
+
+def _is_own(kind: type) -> bool:
+    """Whether a class is a user's own, not one of the product."""
+    return kind.__module__.partition(".")[0] != "stages"
 
 
 def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:

@@ -110,11 +110,11 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     [
         ("factor", "faktor", 5, ["no input or parameter 'faktor'", "did you mean 'factor'"]),
         ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
-        ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in m"]),
+        ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in cm or m"]),
         ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'; expected mm, cm, m, km"]),
         ("5 ms", "5 m", 3, ["'5 m' is a length; expected a time in ms or s"]),
-        ("25 cm", "25 rad", 5, ["'25 rad' is an angle; expected a length in m"]),
-        ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in m"]),
+        ("25 cm", "25 rad", 5, ["'25 rad' is an angle; expected a length in cm or m"]),
+        ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in cm or m"]),
         ("bad: [1, 2.5]", "size: 3 cm", 5, ["'3 cm' is a length; expected a number of pixels, such as 3 px"]),
         ("25 cm", "-1 m", 5, ["at least 0 m"]),
         ("25 cm", "true", 5, ["expected a number in m"]),
@@ -236,6 +236,7 @@ def test_an_invalid_set_option_is_named(tmp_path, setting):
 SCALE = "tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]"
 ADD = "tests.flow.toys.Add, a: twice, b: height"
 IMPORTS = "from __future__ import annotations\nfrom tests.flow.toys import *\n"
+IMPORTS += "from collections.abc import Sequence; from typing import Literal\n"
 OWN = (
     IMPORTS
     + """@dataclass(frozen=True)
@@ -266,11 +267,19 @@ def own(field="int", takes="couple: Couple", returns="Couple"):
     (own(returns="Couple | Number"), SCALE, "Own, couple: both",
      "5: Own.__call__ does not say which one type it returns"),
     (IDLE, ADD, "Own", "6: 'sum' has no input"),
-    (ODD, ADD, "Own, a: twice, b: height", "6: KeyError: 'nix' (MODULE.py, line 7; --debug"),
+    (ODD, ADD, "Own, a: twice, b: height", "6: KeyError: 'nix' (MODULE.py, line 8; --debug"),
     (PLAIN, SCALE, "Own", "5: MODULE.Own is no dataclass; decorate"),
     (IMPORTS + "class Own(Scale):\n    more: int = field(default=0)\n", SCALE, "Own, couple: both",
      "5: MODULE.Own has parameters, but is no dataclass; decorate it with @dataclass(frozen=True)"),
-    (PLAIN + "def function(): ...\n", SCALE, "function", "5: MODULE.function is no dataclass; decorate"),
+    (PLAIN + "def function(): ...\n", SCALE, "function",
+     "5: MODULE.function is no dataclass; a stage is a class with __call__"),
+    *((own(field=field), SCALE, f"Own, couple: both, a: {value}", f"5: MODULE.Own.a: {why}") for field, value, why in (
+        ("list[int]", "[1, 'x']", "'x' is not a number"), ("Sequence[int]", "5", "expected a list, not 5"),
+        ("tuple[int, str]", "[1, 2]", "expected a text, not 2"), ("dict[str, int]", "{n: x}", "'x' is not a number"),
+        ("tuple[int, str]", "[1]", "expected 2 values, not [1]"), ("dict[str, int]", "3", "expected a mapping, not 3"),
+        ("Literal['x', 'y']", "z", "must be one of x, y, not 'z'"),
+        ("bool", "'no'", "expected true or false, not 'no'"),
+    )),
 ])  # fmt: skip
 def test_a_mistake_in_a_module_of_ones_own_is_named_with_its_line(tmp_path, source, replaced, entry, message):
     module = tmp_path.name

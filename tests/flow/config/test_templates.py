@@ -140,7 +140,7 @@ def test_optional_applies_to_the_inner_streams(tmp_path):
          ("toy.yaml:8: tests.flow.toys.Scale has no input or parameter 'faktor'; did you mean 'factor'? "
           "(template used at toy.yaml:13)")),
         ("second: 3 m", "second: 3 s",
-         ("toy.yaml:5: tests.flow.toys.Scale.factor: '3 s' is a time; expected a length in m "
+         ("toy.yaml:5: tests.flow.toys.Scale.factor: '3 s' is a time; expected a length in cm or m "
           "(template used at toy.yaml:13)")),
         ("stretch: 25 cm", "stretch: 25 s", "toy.yaml:1: tests.flow.toys.Scale.factor: '25 s' is a time"),
         ("out:  {", "out:  {use: tests.flow.toys.Scale, ", "toy.yaml:13: an entry has 'use' or 'template', not both"),
@@ -223,7 +223,7 @@ def test_one_rover_reaches_every_stage_that_needs_it(name):
     ("override", "message"),
     [
         ("rover.max_stp=1m", "stages.TerrainFeatures.rover has no parameter 'max_stp'; did you mean 'max_step'?"),
-        ("rover.max_step=1s", "stages.TerrainFeatures.rover.max_step: '1s' is a time; expected a length in m"),
+        ("rover.max_step=1s", "stages.TerrainFeatures.rover.max_step: '1s' is a time; expected a length in cm or m"),
         ("rover.wheel=1km", "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
         ("rover=3", "stages.TerrainFeatures.rover: expected a mapping of footprint, wheel_track, wheel, max_step"),
         ("McapSink.compresion=zstd", "recordings.McapSink has no parameter 'compresion'; did you mean 'compression'?"),
