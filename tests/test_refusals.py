@@ -430,6 +430,7 @@ def test_an_unknown_pipeline_is_answered_with_templates_too(refused):
 def test_a_result_log_needs_the_ending_of_a_log(traverse, tmp_path, refused):
     why = refused("run", traverse, "-o", tmp_path / "out.txt")
     assert why.endswith("out.txt is no name of a log; end it in .mcap\n")
+    assert refused("simulate", tmp_path / "out.txt") == why
 
 
 def test_a_pair_of_numbers_may_begin_with_a_minus(result, traverse, tmp_path, said):

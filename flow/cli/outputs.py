@@ -64,7 +64,7 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
             raise UsageError(f"{path} has the name of a log; choose another for a {kind}")
         if path.exists() and not is_ours(path, kind):
             raise UsageError(f"{path} exists and is no {kind} of roverflow; choose another name or remove it")
-        if kind == "result log" and path.suffix.lower() != ".mcap":
+        if kind.endswith("log") and path.suffix.lower() != ".mcap":
             raise UsageError(f"{path} is no name of a log; end it in .mcap")
         check_writable(path)
         taken.append(resolved)

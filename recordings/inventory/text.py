@@ -79,8 +79,8 @@ def _frame_line(frames: dict[str, Any]) -> str:
         f"{counted(frames['left'], 'left image')} and {counted(frames['right'], 'right image')}"
     )
     if frames["with_tilt"] is not None:
-        gap = f"{frames['tilt_gap_s'] * 1e3:g} ms"
-        line += f"; {counted(frames['with_tilt'], 'left image')} with a tilt (readings at most {gap} apart)"
+        gap = f" (readings at most {frames['tilt_gap_s'] * 1e3:g} ms apart)" if frames["with_tilt"] else ""
+        line += f"; {counted(frames['with_tilt'], 'left image')} with a tilt{gap}"
     if frames["delay_s"]:
         unit, scale, form = ("ms", 1e3, ".3g") if max(map(abs, frames["delay_s"])) < 1 else ("s", 1.0, ".1f")
         least, median, most = (format(scale * delay, form) for delay in frames["delay_s"])

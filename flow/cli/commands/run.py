@@ -57,9 +57,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the pipeline, print the verdict and write the summary."""
+    from flow.config.loader import pipeline_file
     from recordings.scoring.result_log import pipeline_of
 
     find_files(options.log)  # refuses a wrong name at once
+    pipeline_file(options.pipeline)
     out = options.out or default_result(options.log)
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
     outputs = {"result log": out, "recording": rrd, "summary": options.summary}
