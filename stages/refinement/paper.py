@@ -18,7 +18,6 @@ from stages.refinement.kernels.wls import smooth
 from stages.stage import Stage, check_joined, check_same_time, parameter
 
 F32 = np.float32
-BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
 UNLIMITED = 1e9  # px: the median replaces every match
 MIN_WEIGHT = 0.05  # WLS weight of a match, however low its confidence
 PLANE_CONFIDENCE, FILLED_CONFIDENCE = 0.8, 0.6  # not calibrated: the paper states none
@@ -134,7 +133,7 @@ class RefinePaper(Stage):
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
             return pixels
-        return joint_bilateral(pixels, guide, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY, every=True)
+        return joint_bilateral(pixels, guide, self.bilateral_radius, every=True)
 
     def _median(self, pixels: Array) -> Array:
         return near_median(pixels, self.median_size, UNLIMITED) if self.median_size else pixels

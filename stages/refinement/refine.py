@@ -24,7 +24,7 @@ from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.refinement.kernels.label_origin import Trust, label_origin
 from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
-from stages.refinement.kernels.plane_fit import Planes, fit_planes
+from stages.refinement.kernels.plane_fit import INLIER_DISTANCE, Planes, fit_planes
 from stages.refinement.kernels.region_merging import merge_regions
 from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
@@ -35,12 +35,9 @@ from stages.stage import Stage, check_joined, check_same_time, parameter
 F32 = np.float32
 SATURATION_LEVEL = 250  # 8-bit level from which an even patch is saturated, a sky for example
 MAX_CORRECTION = 1.0  # px; a match farther from its median or plane stays as it is
-INLIER_DISTANCE = 0.5  # px, from a plane
 MIN_INLIER_SHARE, MIN_VALID_SHARE = 0.8, 0.6  # of a superpixel with an accepted plane; a surface needs half the matches
 MAX_GRADIENT = 0.5  # px/px, of an accepted plane
 MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
-COMPACTNESS = 10.0  # SLIC's weight of position against colour, CIELAB units
-BILATERAL_GRAY, BILATERAL_DISPARITY = 10.0, 1.0  # scales of the bilateral filter, gray levels and px
 DEPTH_EDGE = 1.0  # px between neighbours at an edge of depth
 EDGE_COLOUR = 15.0  # levels of colour over which a neighbour's weight falls to 1/e there
 # Fitted to eight Middlebury scenes and simulated frames, which count alike; tests/study.py prints the true shares.
@@ -183,25 +180,23 @@ class Refine(Stage):
         """Matches pulled to their planes and holes filled from them; the superpixels; where a plane agreed."""
         if not (self.plane_weight or self.plane_fill):
             return pixels, None, np.zeros(pixels.shape, bool)
-        labels, count = superpixels(image, self._count(pixels.size), COMPACTNESS, threads=self.threads)
+        labels, count = superpixels(image, self._count(pixels.size), self.threads)
         margin = self.max_extrapolation if self.plane_fill else -1
-        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, INLIER_DISTANCE, seed, self.threads)
+        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
         accepted = self._accepted(planes, MIN_VALID_SHARE)
         pixels, agreed = pull_to_planes(
             pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight, margin, self.threads
         )
         if not self.surface_size:
             return pixels, labels, agreed
-        group, groups = merge_regions(
-            image, labels, count, max(1, count // self.surface_size), COMPACTNESS, threads=self.threads
-        )
+        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size), self.threads)
         # Every other pixel of every other row is enough for a region.
         few = np.s_[::2, ::2]
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))
         sparse[weights[few] == 0] = np.nan  # filled pixels are no evidence for the second planes
         planes = fit_planes(
-            sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses,
-            INLIER_DISTANCE, seed + 1, self.threads,
+            sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses, seed + 1,
+            self.threads,
         )  # fmt: skip
         accepted = (self._accepted(planes, MIN_VALID_SHARE / 2, 2) * [0.5, 0.5, 1])[group]
         pixels, again = pull_to_planes(
@@ -225,7 +220,7 @@ class Refine(Stage):
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
             return pixels
-        return joint_bilateral(pixels, guide, self.bilateral_radius, BILATERAL_GRAY, BILATERAL_DISPARITY, self.threads)
+        return joint_bilateral(pixels, guide, self.bilateral_radius, self.threads)
 
     def _supported(self, pixels: Array, guessed: Array, frame: StereoFrame) -> tuple[Array, Array, Array]:
         """The supported disparities, their sigma, px, and where the images agree with them, (H, W) bool."""

@@ -14,27 +14,24 @@ from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
-UNKNOWN_VALUE = F32(1e15)  # scales of disparity; its square is within float32
+GRAY_SCALE = 10.0  # levels; that of disparity is 1 px
+UNKNOWN_VALUE = F32(1e15)  # px; its square is within float32
 
 
-def joint_bilateral(
-    disparity: Array, guide: Array, radius: int, gray: float, range_scale: float, threads: int = 1, every: bool = False
-) -> Array:
+def joint_bilateral(disparity: Array, guide: Array, radius: int, threads: int = 1, every: bool = False) -> Array:
     """Average each known disparity with its known neighbours; an unknown one (NaN) stays unknown.
 
     disparity: (H, W) float32, px, NaN = unknown; guide: (H, W) uint8; radius: px, > 0, also the standard deviation of
-    the spatial Gaussian; gray: scale of the difference in the guide, levels; range_scale: scale of the difference in
-    disparity, px; every: whether all pixels of the window count, not only those on the chessboard. Returns (H, W)
-    float32.
+    the spatial Gaussian; every: whether all pixels of the window count, not only those on the chessboard. Returns
+    (H, W) float32.
     """
     height, filtered = disparity.shape[0], np.empty(disparity.shape, np.float32)
     values, levels = np.empty((2, *disparity.shape), np.float32)
-    scales = F32(1 / range_scale), F32(1 / gray)
     both = shared_by(threads)
-    by_bands(both, height, lambda first, end: _prepare(disparity, guide, *scales, first, end, values, levels))
+    by_bands(both, height, lambda first, end: _prepare(disparity, guide, first, end, values, levels))
     given = values, levels, _spatial(radius, every)
     by_bands(both, height, lambda first, end: _filter(*given, first, end, filtered))
-    by_bands(both, height, lambda first, end: _finish(disparity, F32(range_scale), first, end, filtered))
+    by_bands(both, height, lambda first, end: _finish(disparity, first, end, filtered))
     return filtered
 
 
@@ -45,19 +42,19 @@ def _spatial(radius: int, every: bool) -> Array:
 
 
 @kernel
-def _prepare(disparity, guide, per_pixel, per_gray, first, end, values, levels):
-    """values becomes the disparities, levels the guide, each divided by its scale."""
+def _prepare(disparity, guide, first, end, values, levels):
+    """values becomes the disparities, levels the guide divided by its scale."""
     for y in range(first, end):
         for x in range(disparity.shape[1]):
-            values[y, x] = disparity[y, x] * per_pixel if np.isfinite(disparity[y, x]) else UNKNOWN_VALUE
-            levels[y, x] = F32(guide[y, x]) * per_gray
+            values[y, x] = disparity[y, x] if np.isfinite(disparity[y, x]) else UNKNOWN_VALUE
+            levels[y, x] = F32(guide[y, x]) * F32(1 / GRAY_SCALE)
 
 
 @kernel
-def _finish(disparity, scale, first, end, filtered):
+def _finish(disparity, first, end, filtered):
     for y in range(first, end):
         for x in range(disparity.shape[1]):
-            filtered[y, x] = filtered[y, x] * scale if np.isfinite(disparity[y, x]) else F32(np.nan)
+            filtered[y, x] = filtered[y, x] if np.isfinite(disparity[y, x]) else F32(np.nan)
 
 
 @fast_kernel
@@ -86,9 +83,7 @@ def _filter(values, levels, spatial, first, end, filtered):
             filtered[y, x] = sums[x] / weights[x]  # a pixel's own weight is 1
 
 
-def joint_bilateral_reference(
-    disparity: Array, guide: Array, radius: int, gray: float, range_scale: float, every: bool = False
-) -> Array:
+def joint_bilateral_reference(disparity: Array, guide: Array, radius: int, every: bool) -> Array:
     """`joint_bilateral` in plain numpy and float64."""
     height, width = disparity.shape
     values = np.pad(disparity.astype(np.float64), radius, constant_values=np.nan)
@@ -99,8 +94,8 @@ def joint_bilateral_reference(
         for across in range(2 * radius + 1):
             near = values[down : down + height, across : across + width]
             near_gray = levels[down : down + height, across : across + width]
-            weight = spatial[down, across] / (1 + ((near - disparity) / range_scale) ** 2)
-            weight = weight / (1 + ((near_gray - guide) / gray) ** 2)
+            weight = spatial[down, across] / (1 + (near - disparity) ** 2)
+            weight = weight / (1 + ((near_gray - guide) / GRAY_SCALE) ** 2)
             sums += np.where(np.isfinite(weight), weight * near, 0)
             weights += np.where(np.isfinite(weight), weight, 0)
     return np.where(np.isfinite(disparity), sums / np.where(weights > 0, weights, 1), np.nan).astype(np.float32)

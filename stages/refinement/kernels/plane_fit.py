@@ -18,6 +18,7 @@ from stages.data import Array
 F32 = np.float32
 U64 = np.uint64
 MIN_POINTS = 6  # matches; twice the parameters of a plane, so that agreement is no coincidence
+INLIER_DISTANCE = 0.5  # px, from a plane
 MIN_TRIANGLE = 4.0  # px^2, twice the area of a hypothesis's triangle; slopes of smaller ones are noise
 
 
@@ -39,21 +40,20 @@ def fit_planes(
     count: int,
     weights: Array,
     hypotheses: int,
-    threshold: float = 0.5,
     seed: int = 0,
     threads: int = 1,
 ) -> Planes:
     """Fit one plane to the known disparities of each region.
 
     disparity: (H, W) float32, px, NaN = unknown; labels: (H, W) int32 in 0..count-1; weights: (H, W) float32 > 0, of
-    the least squares; hypotheses: planes tried per region; threshold: px, largest deviation of an inlier. The same seed
-    gives the same planes, with any number of threads.
+    the least squares; hypotheses: planes tried per region. The same seed gives the same planes, with any number of
+    threads.
     """
     assert weights.shape == labels.shape, "a weight for each pixel"
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
     both = shared_by(threads)
     points, start, sizes = known_points(disparity, labels, count, weights, both)
-    given = points, start, sizes, F32(threshold), hypotheses, U64(seed % 2**64)
+    given = points, start, sizes, hypotheses, U64(seed % 2**64)
     by_bands(both, count, lambda first, end: _fit(*given, first, end, *planes))
     return planes
 
@@ -124,8 +124,9 @@ def _random_index(seed, region, counter, n):
 
 
 @kernel
-def _fit(points, start, sizes, threshold, hypotheses, seed, first, end, coefficients, inlier_share, valid_share):
+def _fit(points, start, sizes, hypotheses, seed, first, end, coefficients, inlier_share, valid_share):
     """Fit the planes of regions first to end."""
+    limit = F32(INLIER_DISTANCE**2)
     for s in range(first, end):
         own = slice(start[s], start[s + 1])
         x, y, d, w = points[0, own], points[1, own], points[2, own], points[3, own]
@@ -139,12 +140,12 @@ def _fit(points, start, sizes, threshold, hypotheses, seed, first, end, coeffici
         origin_x, origin_y = x[0], y[0]
         x -= origin_x
         y -= origin_y
-        cost, a, b, c = _best_hypothesis(x, y, d, threshold * threshold, hypotheses, seed, s)
+        cost, a, b, c = _best_hypothesis(x, y, d, limit, hypotheses, seed, s)
         if cost >= F32(1e30):
             continue
         for _ in range(2):
-            a, b, c = _least_squares(x, y, d, w, a, b, c, threshold * threshold)
-        inlier_share[s] = F32(_count_inliers(x, y, d, a, b, c, threshold * threshold) / x.size)
+            a, b, c = _least_squares(x, y, d, w, a, b, c, limit)
+        inlier_share[s] = F32(_count_inliers(x, y, d, a, b, c, limit) / x.size)
         coefficients[s, 0], coefficients[s, 1] = a, b
         coefficients[s, 2] = np.float64(c) - np.float64(a) * origin_x - np.float64(b) * origin_y
 
@@ -222,7 +223,6 @@ def fit_planes_reference(
     count: int,
     weights: Array,
     hypotheses: int,
-    threshold: float = 0.5,
     seed: int = 0,
 ) -> Planes:
     """`fit_planes` in plain numpy and float64, one region after the other, with the same hypotheses."""
@@ -242,17 +242,17 @@ def fit_planes_reference(
             if abs(np.linalg.det(points[corners])) < MIN_TRIANGLE:
                 continue
             candidate = np.linalg.solve(points[corners], d[corners])
-            cost = float(np.minimum((points @ candidate - d) ** 2, threshold**2).sum())
+            cost = float(np.minimum((points @ candidate - d) ** 2, INLIER_DISTANCE**2).sum())
             if cost < best:
                 best, plane = cost, candidate
         if plane is None:
             continue
         for _ in range(2):
-            inlier = (points @ plane - d) ** 2 < threshold**2
+            inlier = (points @ plane - d) ** 2 < INLIER_DISTANCE**2
             if inlier.sum() >= MIN_POINTS:
                 plane = np.linalg.lstsq(points[inlier] * root[inlier, None], d[inlier] * root[inlier], rcond=None)[0]
         planes.coefficients[s] = plane
-        planes.inlier_share[s] = ((points @ plane - d) ** 2 < threshold**2).mean()
+        planes.inlier_share[s] = ((points @ plane - d) ** 2 < INLIER_DISTANCE**2).mean()
     return planes
 
 

@@ -14,25 +14,23 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import shared_by
 from stages.data import Array
+from stages.refinement.kernels.slic import COMPACTNESS
 
 ITERATIONS = 3
 NEIGHBOUR_CELLS = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
 
 
-def merge_regions(
-    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0, threads: int = 1
-) -> tuple[Array, int]:
+def merge_regions(image: Array, labels: Array, count: int, groups: int, threads: int = 1) -> tuple[Array, int]:
     """Merge superpixels into about `groups` regions.
 
-    image: (H, W) gray or (H, W, 3) RGB, uint8; labels: (H, W) int32 in 0..count-1; compactness: weight of position
-    against colour, CIELAB units at one grid step. Returns the region of each superpixel, (count,) int32 in 0..n-1, and
-    n.
+    image: (H, W) gray or (H, W, 3) RGB, uint8; labels: (H, W) int32 in 0..count-1. Returns the region of each
+    superpixel, (count,) int32 in 0..n-1, and n.
     """
     height, width = image.shape[:2]
     step = math.sqrt(height * width / min(groups, count))
     rows, cols = max(1, round(height / step)), max(1, round(width / step))
-    points, size = _superpixel_points(image, labels, count, compactness / step, threads)
-    home = np.floor(points[:, 3:] / (compactness / step) * [rows / height, cols / width]).astype(int)
+    points, size = _superpixel_points(image, labels, count, COMPACTNESS / step, threads)
+    home = np.floor(points[:, 3:] / (COMPACTNESS / step) * [rows / height, cols / width]).astype(int)
     nearest = _nearest_cells(points, size, np.minimum(home, [rows - 1, cols - 1]), rows, cols)
     used, region = np.unique(nearest, return_inverse=True)
     return region.astype(np.int32), len(used)
@@ -96,9 +94,7 @@ def _add_pixels(image, labels, first, sums):
             total[5] += 1
 
 
-def merge_regions_reference(
-    image: Array, labels: Array, count: int, groups: int, compactness: float = 10.0
-) -> tuple[Array, int]:
+def merge_regions_reference(image: Array, labels: Array, count: int, groups: int) -> tuple[Array, int]:
     """`merge_regions` in plain numpy, superpixel after superpixel."""
     height, width = image.shape[:2]
     step = math.sqrt(height * width / min(groups, count))
@@ -110,8 +106,8 @@ def merge_regions_reference(
         rgb = np.rint(colour.sum(axis=0) / len(y)).astype(np.uint8)
         points[s, :3] = cv2.cvtColor(rgb[None, None], cv2.COLOR_RGB2LAB)[0, 0] * [100 / 255, 1, 1]
         place = np.array([y.sum() / len(y), x.sum() / len(x)]) + 0.5
-        points[s, 3:], sizes[s] = place * (compactness / step), len(y)
-        place = points[s, 3:] / (compactness / step)
+        points[s, 3:], sizes[s] = place * (COMPACTNESS / step), len(y)
+        place = points[s, 3:] / (COMPACTNESS / step)
         home[s] = np.minimum(np.floor(place * [rows / height, cols / width]), [rows - 1, cols - 1])
     nearest = home[:, 0] * cols + home[:, 1]
     for _ in range(ITERATIONS):

@@ -22,6 +22,7 @@ from stages.matching.kernels.resample import halved
 
 F32 = np.float32
 _workspaces = Workspaces()
+COMPACTNESS = 10.0  # weight of position against colour, CIELAB units at one grid step
 LIGHTNESS_SCALE = F32(100 / 255)  # from 8 bits to L in 0..100
 NO_CENTRE = F32(1e30)
 ITERATIONS = 2  # of the centres, before the last assignment
@@ -29,11 +30,10 @@ TILE = 64  # pixels of a row whose nearest centres are found together
 MIN_HALVED_CELL = 8  # px; with smaller grid cells the centres move at full resolution
 
 
-def superpixels(image: Array, count: int, compactness: float = 10.0, threads: int = 1) -> tuple[Array, int]:
+def superpixels(image: Array, count: int, threads: int = 1) -> tuple[Array, int]:
     """Segment an image into about `count` connected superpixels.
 
-    image: (H, W) gray or (H, W, 3) RGB, uint8; compactness: weight of position against colour, in CIELAB units at one
-    grid step. Returns the labels, (H, W) int32 in 0..n-1, and n.
+    image: (H, W) gray or (H, W, 3) RGB, uint8. Returns the labels, (H, W) int32 in 0..n-1, and n.
     """
     height, width = image.shape[:2]
     count = min(count, height * width)
@@ -48,10 +48,10 @@ def superpixels(image: Array, count: int, compactness: float = 10.0, threads: in
         small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]), both)
         centres = _grid_centres(small, *grid)
         for _ in range(ITERATIONS):
-            _move_centres(small, centres, grid, compactness / step * scale, both)
+            _move_centres(small, centres, grid, COMPACTNESS / step * scale, both)
         if scale == 2:
             centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
-        labels = _labels(colour, centres, grid, compactness / step, both)
+        labels = _labels(colour, centres, grid, COMPACTNESS / step, both)
         total = connect(labels, min_size, space.array((3, height * width), np.int32), both)
     return labels, total
 

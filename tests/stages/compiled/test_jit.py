@@ -31,7 +31,7 @@ y, x = np.mgrid[:120, :160]
 labels = (y // 11 * 15 + x // 11).astype(np.int32)
 disparity = random.normal(0, 0.3, y.shape) + 0.01 * x + 0.1 * y + 3 * (random.random(y.shape) < 0.2)
 weights = random.random(y.shape).astype(np.float32)
-found = fit_planes(disparity.astype(np.float32), labels, labels.max() + 1, weights, 16, 0.5, 7)
+found = fit_planes(disparity.astype(np.float32), labels, labels.max() + 1, weights, 16, 7)
 print(found.coefficients.tobytes().hex())
 """
 

@@ -19,6 +19,6 @@ def random_disparity(height, width, seed):
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(1, 5), st.integers(0, 2**31), st.booleans())
 def test_the_filter_equals_its_reference(height, width, radius, seed, every):
     disparity, guide = random_disparity(height, width, seed)
-    ours = joint_bilateral(disparity, guide, radius, 15.0, 4.0, every=every)
-    plain = joint_bilateral_reference(disparity, guide, radius, 15.0, 4.0, every)
+    ours = joint_bilateral(disparity, guide, radius, every=every)
+    plain = joint_bilateral_reference(disparity, guide, radius, every)
     assert ours == pytest.approx(plain, abs=1e-4, nan_ok=True)
