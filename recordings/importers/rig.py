@@ -63,13 +63,11 @@ class Rig(Checked):
         """Raise LogError if one of the entries is missing that the data set does not say."""
         for known in fields(self):
             if known.name in names and getattr(self, known.name) is None:
-                unit = {"rad": ", with deg", "m": ", with m"}.get(known.metadata.get("unit", ""), "")
+                unit = {"rad": ", in deg", "m": ", in m"}.get(known.metadata.get("unit", ""), "")
                 choices = known.metadata.get("choices")
                 of = f": {' or '.join(map(str, choices))}" if choices else unit
-                where = self.where or "there is no rig file (--rig FILE), which"
-                raise LogError(
-                    f"{where} lacks '{known.name}' ({known.metadata['help']}{of}); {kind} does not contain it"
-                )
+                wanted = f"{self.where} lacks" if self.where else "give a rig file (--rig FILE) with"
+                raise LogError(f"{wanted} '{known.name}' ({known.metadata['help']}{of}); {kind} does not contain it")
 
     @property
     def mount(self) -> Transform | None:

@@ -156,7 +156,9 @@ def test_an_odometry_sequence_is_the_simulators_log(tmp_path, said, refused, key
     assert "the car is taken as level" in said(0, "import", "kitti", folder, log, "--rig", rig).out
     assert_same(log, own, stamps=False, tolerance=1e-7)
     text = refused("import", "kitti", folder, log)
-    assert "lacks 'height' (height of the left camera above base_link, with m); KITTI's odometry" in text
+    assert (
+        "give a rig file (--rig FILE) with 'height' (height of the left camera above base_link, in m); KITTI's" in text
+    )
 
 
 def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, said):

@@ -109,7 +109,7 @@ def test_a_part_of_katwijk_is_the_simulators_log(tmp_path, said, refused, outwar
     np.testing.assert_allclose(*rotations, atol=1e-9)
     assert seen_in(log)[0].mount.translation[2] == 0.9
     assert {item.latitude for _, _, item in iter_decoded(log, ["/gps/fix"])} == {52.2}
-    assert "lacks 'height'" in refused("import", "katwijk", folder, log, *given[:2])
+    assert "with 'height'" in refused("import", "katwijk", folder, log, *given[:2])
     assert roverflow("import", "katwijk", folder, log, "--calibration", folder / "rig.yaml", *given[2:]) == 2
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from skimage import data
 
 from stages.refinement.kernels.region_merging import merge_regions, merge_regions_reference
 from stages.refinement.kernels.slic import superpixels
@@ -21,14 +20,6 @@ def test_regions_equal_the_reference(height, width, aimed, groups, seed, threads
     expected, expected_total = merge_regions_reference(image, labels, count, groups)
     assert np.array_equal(region, expected)
     assert total == expected_total
-
-
-def test_regions_of_a_photo_equal_the_reference():
-    image = np.ascontiguousarray(data.astronaut()[:200, 100:340])
-    labels, count = superpixels(image, 300)
-    region, total = merge_regions(image, labels, count, 20)
-    assert np.array_equal(region, merge_regions_reference(image, labels, count, 20)[0])
-    assert 10 <= total <= 30
 
 
 @pytest.mark.parametrize("threads", [1, 2])
