@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +101,6 @@ def _disparity(message: Any, origins: Any) -> Disparity:
     return Disparity(ros2.stamp_of(message.header), pixels, source, unstated)
 
 
-def _data(message: Any) -> Any:
-    return message.data
-
-
 # Schema -> the part of the topic that belongs to its messages, and what reads both
 _JOINED: dict[str, tuple[str, Callable[[Any, Any], Any]]] = {
     "stereo_msgs/msg/DisparityImage": ("source", _disparity),
@@ -113,6 +110,8 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "grid_map_msgs/msg/GridMap": ros2.read_grid_map,
     "nav_msgs/msg/Odometry": lambda message: ros2.pose_of(message, 0, "base_link"),
     "sensor_msgs/msg/PointCloud2": ros2.read_point_cloud,
-    **dict.fromkeys(("std_msgs/msg/Float64", "std_msgs/msg/Int64", "std_msgs/msg/Bool", "std_msgs/msg/String"), _data),
+    **dict.fromkeys(
+        ("std_msgs/msg/Float64", "std_msgs/msg/Int64", "std_msgs/msg/Bool", "std_msgs/msg/String"), attrgetter("data")
+    ),
 }
 _READABLE = ", ".join(name.rpartition("/")[2] for name in (*_JOINED, *_READERS))

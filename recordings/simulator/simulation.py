@@ -157,8 +157,8 @@ class Simulation:
                 if getattr(self, name) is None:
                     object.__setattr__(self, name, min(value, self._ground_left()) if name in GROUND else value)
         check_parameters(self)
-        if (total := self.sand + self.dust + self.bedrock) > 1 + 1e-9:
-            raise ValueError(f"Simulation.sand must be at most 1 with dust and bedrock, not {total:g} together")
+        if (ground := 100 * (self.sand + self.dust + self.bedrock)) > 100 + 1e-7:
+            raise ValueError(f"Simulation.sand must be at most 100 % with dust and bedrock, not {ground:g} %")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
 

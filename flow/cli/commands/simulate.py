@@ -16,67 +16,67 @@ from flow.errors import COMPLETE, UsageError
 
 HELP = "write a synthetic traverse with ground truth topics under /truth"
 
-DEGREE, PERCENT, MILLISECOND = math.radians(1), 0.01, 0.001
+UNITS = {"DEG": math.radians(1), "PERCENT": 0.01, "MS": 0.001}  # of values, in those of recordings.simulator.Simulation
+TYPES: dict[str, type] = {"N": int, "QUALITY": int, "NAME": str, "KIND": str}  # of values; the others are float
+FIELDS = {"rocks": "abundance"}  # option -> field of Simulation, where it has another name
 
-# option -> (field of recordings.simulator.Simulation, its type, its unit, name of the value, help)
-OPTIONS: dict[str, tuple[str, type, float, str, str]] = {
-    "scene": ("scene", str, 1, "NAME", "defaults for gravel, mixed, dunes, dusk or bedrock (mixed)"),
-    "frames": ("frames", int, 1, "N", "number of stereo frames (12)"),
-    "seed": ("seed", int, 1, "N", "random seed of terrain and noise (1)"),
-    "baseline": ("baseline", float, 1, "M", "distance between the cameras (0.24)"),
-    "camera_height": ("camera_height", float, 1, "M", "height of the cameras above the ground (0.9)"),
-    "pitch_down": ("pitch_down", float, DEGREE, "DEG", "angle of the cameras below the horizon (15)"),
-    "rocks": ("abundance", float, 1, "K", "ground under rocks, Golombek's k (0.1; dunes: 0.015; bedrock: 0.05)"),
-    "slope": ("slope", float, DEGREE, "DEG", "RMS slope of the terrain (4)"),
-    "sand": ("sand", float, PERCENT, "PERCENT", "ground that is sand (mixed: 45)"),
-    "dust": ("dust", float, PERCENT, "PERCENT", "ground that is dust (mixed: 10)"),
-    "bedrock": ("bedrock", float, PERCENT, "PERCENT", "ground that is bedrock; the rest is gravel (mixed: 15)"),
-    "sand_contrast": ("sand_contrast", float, 1, "GRAY", "contrast of sand over a few pixels, RMS at mid-gray (2)"),
-    "gravel_contrast": ("gravel_contrast", float, 1, "GRAY", "the same of gravel (gravel: 18, others: 12)"),
-    "ripples": ("ripples", float, 1, "GRAY", "RMS contrast of the ripples of sand (1; dunes: 3)"),
-    "sun_elevation": ("sun_elevation", float, DEGREE, "DEG", "height of the sun (38; dunes: 30; dusk: 6; bedrock: 45)"),
-    "sun_azimuth": ("sun_azimuth", float, DEGREE, "DEG", "direction of the sun, from the world's x towards y (140)"),
-    "skylight": ("skylight", float, 1, "LIGHT", "light in the shadows; the sun's is 0.86 (0.24; dusk: 0.1)"),
-    "brightness": ("brightness", float, 1, "FACTOR", "exposure; below 1, the images are darker (1; dusk: 0.75)"),
-    "noise": ("noise", float, 1, "GRAY", "noise of the gray image, one sigma at mid-gray (1.5; dusk: 3; gravel: 1.36)"),
-    "blur": ("blur", float, 1, "PX", "lens blur, one sigma (0.55)"),
-    "vignetting": ("vignetting", float, PERCENT, "PERCENT", "light that the corners lose (14)"),
+# option -> (name of the value, help)
+OPTIONS = {
+    "scene": ("NAME", "defaults for gravel, mixed, dunes, dusk or bedrock (mixed)"),
+    "frames": ("N", "number of stereo frames (12)"),
+    "seed": ("N", "random seed of terrain and noise (1)"),
+    "baseline": ("M", "distance between the cameras (0.24)"),
+    "camera_height": ("M", "height of the cameras above the ground (0.9)"),
+    "pitch_down": ("DEG", "angle of the cameras below the horizon (15)"),
+    "rocks": ("K", "ground under rocks, Golombek's k (0.1; dunes: 0.015; bedrock: 0.05)"),
+    "slope": ("DEG", "RMS slope of the terrain (4)"),
+    "sand": ("PERCENT", "ground that is sand (mixed: 45)"),
+    "dust": ("PERCENT", "ground that is dust (mixed: 10)"),
+    "bedrock": ("PERCENT", "ground that is bedrock; the rest is gravel (mixed: 15)"),
+    "sand_contrast": ("GRAY", "contrast of sand over a few pixels, RMS at mid-gray (2)"),
+    "gravel_contrast": ("GRAY", "the same of gravel (gravel: 18, others: 12)"),
+    "ripples": ("GRAY", "RMS contrast of the ripples of sand (1; dunes: 3)"),
+    "sun_elevation": ("DEG", "height of the sun (38; dunes: 30; dusk: 6; bedrock: 45)"),
+    "sun_azimuth": ("DEG", "direction of the sun, from the world's x towards y (140)"),
+    "skylight": ("LIGHT", "light in the shadows; the sun's is 0.86 (0.24; dusk: 0.1)"),
+    "brightness": ("FACTOR", "exposure; below 1, the images are darker (1; dusk: 0.75)"),
+    "noise": ("GRAY", "noise of the gray image, one sigma at mid-gray (1.5; dusk: 3; gravel: 1.36)"),
+    "blur": ("PX", "lens blur, one sigma (0.55)"),
+    "vignetting": ("PERCENT", "light that the corners lose (14)"),
     "exposure_difference": (
-        "exposure_difference", float, PERCENT, "PERCENT",
+        "PERCENT",
         "extra light in the right image, on top of the 0.5 to 1 %% that the seed adds (0)",
     ),
-    "row_offset": ("row_offset", float, 1, "PX", "rows by which the right image is too low (0)"),
-    "exposure_time": ("exposure_time", float, MILLISECOND, "MS", "time of an exposure, for motion blur (0)"),
-    "jpeg": ("jpeg", int, 1, "QUALITY", "write JPEG images of this quality, 1 to 100 (not compressed)"),
-    "tilt_noise": ("tilt_noise", float, DEGREE, "DEG", "inclinometer noise, one sigma (0.1)"),
-    "imu": ("imu", str, 1, "KIND", "orientation, or raw: accelerations and rates of a MEMS sensor (orientation)"),
-    "vibration": ("vibration", float, 1, "M/S2", "vibration of a raw Imu while driving, RMS of each axis (0.5)"),
-    "rest": ("rest", float, 1, "S", "time that the rover stands still before it drives (0)"),
-    "pan": ("pan", float, DEGREE, "DEG", "largest turn of the mast with the cameras; it swings once in 8 s (0)"),
-    "odometry_scale": (
-        "odometry_scale", float, PERCENT, "PERCENT", "scale error of odometry (1); 0, with --odometry-turn 0, is exact",
-    ),
+    "row_offset": ("PX", "rows by which the right image is too low (0)"),
+    "exposure_time": ("MS", "time of an exposure, for motion blur (0)"),
+    "jpeg": ("QUALITY", "write JPEG images of this quality, 1 to 100 (not compressed)"),
+    "tilt_noise": ("DEG", "inclinometer noise, one sigma (0.1)"),
+    "imu": ("KIND", "orientation, or raw: accelerations and rates of a MEMS sensor (orientation)"),
+    "vibration": ("M/S2", "vibration of a raw Imu while driving, RMS of each axis (0.5)"),
+    "rest": ("S", "time that the rover stands still before it drives (0)"),
+    "pan": ("DEG", "largest turn of the mast with the cameras; it swings once in 8 s (0)"),
+    "odometry_scale": ("PERCENT", "scale error of odometry (1); 0, with --odometry-turn 0, is exact"),
     "odometry_turn": (
-        "odometry_turn", float, DEGREE, "DEG",
+        "DEG",
         "heading drift of odometry after 1 m, one sigma; it grows with the root of the distance (0.2)",
     ),
-}  # fmt: skip
+}
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
     sub.add_argument("out", type=Path, metavar="OUT.mcap", help="the log to write")
     sub.add_argument("--size", type=size, default=(1280, 960), metavar="WxH", help="image size (1280x960)")
-    for option, (_, kind, _, metavar, text) in OPTIONS.items():
-        sub.add_argument(f"--{option.replace('_', '-')}", type=kind, metavar=metavar, help=text)
+    for option, (metavar, text) in OPTIONS.items():
+        sub.add_argument(f"--{option.replace('_', '-')}", type=TYPES.get(metavar, float), metavar=metavar, help=text)
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the traverse."""
     check_outputs({"input log": options.out})
     settings = {
-        field: value * unit if kind is float else value
-        for option, (field, kind, unit, *_) in OPTIONS.items()
+        FIELDS.get(option, option): value * UNITS[metavar] if metavar in UNITS else value
+        for option, (metavar, _) in OPTIONS.items()
         if (value := getattr(options, option)) is not None
     }
     width, height = options.size
@@ -89,8 +89,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _with_options(sentence: str) -> str:
     """The sentence about a field of Simulation, with the name of the option instead."""
-    for option, (field, *_) in OPTIONS.items():
-        sentence = sentence.replace(f"Simulation.{field} ", f"--{option.replace('_', '-')} ")
+    for option in OPTIONS:
+        sentence = sentence.replace(f"Simulation.{FIELDS.get(option, option)} ", f"--{option.replace('_', '-')} ")
     for side in ("width", "height"):
         sentence = sentence.replace(f"Simulation.{side} ", f"the {side} of --size ")
     return sentence
