@@ -16,19 +16,7 @@ from collections.abc import Iterator, Sequence
 from types import ModuleType
 from typing import Any, NoReturn
 
-from flow.cli.commands import (
-    demo,
-    export,
-    fleet,
-    graph,
-    info,
-    listing,
-    pipeline,
-    run,
-    score,
-    simulate,
-    stages,
-)
+from flow.cli.commands import demo, export, fleet, graph, info, listing, pipeline, run, score, simulate, stages
 from flow.cli.debugging import attempt, desk, diff, report, why
 from flow.cli.importers import images, middlebury
 from flow.cli.importers.data_sets import DATA_SETS, DataSet

@@ -51,8 +51,7 @@ def pixels_of(message: Any, size: tuple[int, int] | None = None, max_pixels: int
     """The pixels of a sensor_msgs Image or CompressedImage, gray (H, W) or RGB (H, W, 3), uint8 or uint16.
 
     size: width and height of the calibration; an image of another size is refused before it is decoded, as is one of
-    more than `max_pixels`. Raises LogError
-    if the image is damaged, cut, or in an unsupported encoding.
+    more than `max_pixels`. Raises LogError if the image is damaged, cut, or in an unsupported encoding.
     """
     read = _raw_pixels if hasattr(message, "encoding") else _compressed_pixels
     return read(message, size, max_pixels)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from recordings.containers.time_range import MAX_LATENESS_NS, TimeRange
 from recordings.errors import LogError, sentence_of
@@ -30,6 +29,7 @@ from recordings.scoring.side_by_side import Messages, frames
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
+from stages.data.rotations import matrix_of
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
 TRUTHS = (
@@ -355,8 +355,7 @@ def _lens(disparity: Any) -> str:
 
 
 def _rotation(quaternion: Any) -> Array:
-    xyzw = [quaternion.x, quaternion.y, quaternion.z, quaternion.w]
-    return np.asarray(Rotation.from_quat(xyzw).as_matrix())
+    return matrix_of([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
 
 
 def _rocks(message: Any) -> Array:

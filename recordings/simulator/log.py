@@ -21,8 +21,8 @@ Messages = dict[str, Any]  # by topic
 ROCK_FIELDS = ("x", "y", "z", "diameter", "height", "pixels", "shown")
 
 
-def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], None] | None = None) -> None:
-    """Write the log of a traverse into an MCAP file; progress: called with (frames written, frames) after each frame.
+def write_log(simulation: Simulation, out: Path, progress: Callable[[int], object] = lambda done: None) -> None:
+    """Write the log of a traverse into an MCAP file; progress: called with the frames written so far after each.
 
     Examples
     --------
@@ -34,8 +34,8 @@ def write_log(simulation: Simulation, out: Path, progress: Callable[[int, int], 
         for log_time, make_messages, index in sorted(_moments(simulation), key=lambda moment: moment[0]):
             for topic, message in make_messages().items():
                 writer.write(topic, message, log_time)
-            if index is not None and progress is not None:
-                progress(index + 1, simulation.frames)
+            if index is not None:
+                progress(index + 1)
 
 
 def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], Messages], int | None]]:

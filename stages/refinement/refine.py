@@ -171,16 +171,14 @@ class Refine(Stage):
     def _median(self, matches: Array) -> Array:
         return near_median(matches, self.median_size, MAX_CORRECTION, self.threads) if self.median_size else matches
 
-    def _count(self, pixels: int) -> int:
-        return max(1, min(self.superpixels, pixels // self.min_superpixel_size))
-
     def _with_planes(
         self, pixels: Array, weights: Array, within: Extent, image: Array, seed: int
     ) -> tuple[Array, Array | None, Array]:
         """Matches pulled to their planes and holes filled from them; the superpixels; where a plane agreed."""
         if not (self.plane_weight or self.plane_fill):
             return pixels, None, np.zeros(pixels.shape, bool)
-        labels, count = superpixels(image, self._count(pixels.size), self.threads)
+        aimed = max(1, min(self.superpixels, pixels.size // self.min_superpixel_size))
+        labels, count = superpixels(image, aimed, self.threads)
         margin = self.max_extrapolation if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
         accepted = self._accepted(planes, MIN_VALID_SHARE)

@@ -107,9 +107,5 @@ def simulate(out: Path, **settings: Any) -> None:
     except ValueError as error:
         raise UsageError(str(error)) from None
     with tqdm(total=simulation.frames, unit="frame", disable=not sys.stderr.isatty()) as bar:
-
-        def progress(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
-        write_log(simulation, out, progress)
+        write_log(simulation, out, lambda done: bar.update(done - bar.n))
     say(f"{out}: {counted(simulation.frames, 'frame')} with ground truth ({out.stat().st_size / 1e6:.1f} MB)")

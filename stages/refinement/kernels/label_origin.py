@@ -110,14 +110,7 @@ def label_origin_reference(
     moved = np.where(consistent & (sigma > 0), MEASURED, PLANE)
     codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, MEASURED, moved, PLANE, FILLED]
     tables = [np.interp(own, MATCH_CONFIDENCES, values) * within for values in (trust.agreed, trust.alone)]
-    worths: list[Any] = [
-        0.0,
-        trust.mismatch,
-        *tables,
-        trust.backed * within,
-        trust.replaced,
-        trust.plane,
-        trust.mismatch,
-    ]
+    backed = trust.backed * within
+    worths: list[Any] = [0.0, trust.mismatch, *tables, backed, trust.replaced, trust.plane, trust.mismatch]
     source = np.select(conditions, codes, FILLED).astype(np.uint8)
     return source, np.select(conditions, worths, trust.occlusion).astype(np.float32)

@@ -35,13 +35,7 @@ class Planes(NamedTuple):
 
 
 def fit_planes(
-    disparity: Array,
-    labels: Array,
-    count: int,
-    weights: Array,
-    hypotheses: int,
-    seed: int = 0,
-    threads: int = 1,
+    disparity: Array, labels: Array, count: int, weights: Array, hypotheses: int, seed: int = 0, threads: int = 1
 ) -> Planes:
     """Fit one plane to the known disparities of each region.
 
@@ -218,12 +212,7 @@ def _count_inliers(x, y, d, a, b, c, limit):
 
 
 def fit_planes_reference(
-    disparity: Array,
-    labels: Array,
-    count: int,
-    weights: Array,
-    hypotheses: int,
-    seed: int = 0,
+    disparity: Array, labels: Array, count: int, weights: Array, hypotheses: int, seed: int = 0
 ) -> Planes:
     """`fit_planes` in plain numpy and float64, one region after the other, with the same hypotheses."""
     planes = Planes(np.full((count, 3), np.nan), np.zeros(count, np.float32), np.zeros(count, np.float32))

@@ -17,7 +17,6 @@ from stages.data import Array
 from stages.refinement.kernels.slic import COMPACTNESS
 
 ITERATIONS = 3
-NEIGHBOUR_CELLS = np.array([(row, col) for row in (-1, 0, 1) for col in (-1, 0, 1)])
 
 
 def merge_regions(image: Array, labels: Array, count: int, groups: int, threads: int = 1) -> tuple[Array, int]:
@@ -114,7 +113,7 @@ def merge_regions_reference(image: Array, labels: Array, count: int, groups: int
         members = [nearest == k for k in range(rows * cols)]
         centres = [(points[m] * sizes[m, None]).sum(axis=0) / sizes[m].sum() if m.any() else None for m in members]
         for s in range(count):
-            around = [tuple(home[s] + step) for step in NEIGHBOUR_CELLS]
+            around = [(home[s, 0] + down, home[s, 1] + across) for down in (-1, 0, 1) for across in (-1, 0, 1)]
             inside = [r * cols + c for r, c in around if 0 <= r < rows and 0 <= c < cols]
             reached = [k for k in inside if centres[k] is not None]
             nearest[s] = min(reached, key=lambda k: ((points[s] - centres[k]) ** 2).sum())
