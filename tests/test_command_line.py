@@ -219,7 +219,8 @@ def test_a_run_that_replaces_the_result_of_another_pipeline_says_so(traverse, tm
     for pipeline, noted in (("rover", False), ("fast", True), ("fast", False)):
         printed = said(0, "run", tmp_path / "log.mcap", "-p", pipeline, *SMALL, "--no-rrd", "--end", 1).out
         assert (note in printed) == noted
-    assert "note" not in said(2, "run", tmp_path / "log.mcap", "-p", "rovr").out
+    refused = said(2, "run", tmp_path / "log.mcap", "-p", "rovr")
+    assert ("note" in refused.out, "one of accurate, fast, paper, rover; did you mean 'rover'" in refused.err) == (0, 1)
 
 
 def test_a_run_without_any_result_replaces_none(tmp_path, said):

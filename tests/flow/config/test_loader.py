@@ -329,8 +329,3 @@ def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
 def test_an_incomplete_pipeline_file_names_a_file_to_start_from(tmp_path, text):
     with pytest.raises(PipelineError, match=r"toy.yaml:1: .*; begin with a copy of .*/flow/pipelines/rover.yaml"):
         loaded(tmp_path, text)
-
-
-def test_an_unknown_pipeline_lists_those_that_ship():
-    with pytest.raises(UsageError, match="did you mean 'rover'"):
-        load("rovr")

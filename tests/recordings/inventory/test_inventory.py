@@ -212,7 +212,9 @@ def test_damage_is_reported(tmp_path):
 
 def test_without_a_tilt_no_frame_has_one(tmp_path):
     edit = changed(TILT, {"orientation_covariance": np.full(9, -1.0)})
-    assert inventory_of(write_sample(tmp_path / "log.mcap", edit))["frames"]["with_tilt"] == 0
+    found = inventory_of(write_sample(tmp_path / "log.mcap", edit))
+    assert found["frames"]["with_tilt"] == 0
+    assert "; 0 left images with a tilt; " in format_description(found)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)

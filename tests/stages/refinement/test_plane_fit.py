@@ -42,25 +42,17 @@ def test_outliers_and_holes_do_not_move_the_planes(tiles):
     assert planes.valid_share == pytest.approx(0.9, abs=0.05)
 
 
-def test_equals_the_plain_reference_with_the_same_draws(tiles):
-    disparity, labels, _ = tiles
-    ours = fit_planes(disparity, labels, 6, ALIKE, 16, seed=11)
-    plain = fit_planes_reference(disparity, labels, 6, ALIKE, 16, seed=11)
-    assert ours.coefficients[:, :2] == pytest.approx(plain.coefficients[:, :2], abs=2e-5)
-    images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
-    assert images[0] == pytest.approx(images[1], abs=1e-4)
-    assert np.array_equal(ours.inlier_share, plain.inlier_share)
-    assert np.array_equal(ours.valid_share, plain.valid_share)
-
-
-def test_weights_count_in_the_least_squares_as_in_the_reference(tiles):
+def test_equals_the_plain_reference_with_the_same_draws_and_weights(tiles):
     disparity, labels, _ = tiles
     weights = np.random.default_rng(8).uniform(0.05, 1, SHAPE).astype(np.float32)
-    ours = fit_planes(disparity, labels, 6, weights, 16)
-    plain = fit_planes_reference(disparity, labels, 6, weights, 16)
-    images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
-    assert images[0] == pytest.approx(images[1], abs=1e-4)
-    unweighted = render_planes(fit_planes(disparity, labels, 6, ALIKE, 16).coefficients, labels)
+    for some in (ALIKE, weights):
+        ours, plain = (fit(disparity, labels, 6, some, 16, seed=11) for fit in (fit_planes, fit_planes_reference))
+        assert ours.coefficients[:, :2] == pytest.approx(plain.coefficients[:, :2], abs=2e-5)
+        images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
+        assert images[0] == pytest.approx(images[1], abs=1e-4)
+        assert np.array_equal(ours.inlier_share, plain.inlier_share)
+        assert np.array_equal(ours.valid_share, plain.valid_share)
+    unweighted = render_planes(fit_planes(disparity, labels, 6, ALIKE, 16, seed=11).coefficients, labels)
     assert np.abs(images[0] - unweighted).max() > 1e-3
 
 
