@@ -22,18 +22,8 @@ def test_origin_and_confidence_equal_the_reference(height, width, seed, threads)
     confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
     reasons = rng.choice(np.array([0, 4, 6, 10], np.uint8), shape)
     sigma = rng.choice([0, 0.1, 0.3, 2, 1e6], shape).astype(np.float32)
-    given = (
-        matches,
-        confidence,
-        rng.random(shape) < 0.5,
-        kinds,
-        refined,
-        rng.random(shape) < 0.8,
-        reasons,
-        sigma,
-        0.5,
-        TRUST,
-    )
+    agreed, correlated = (rng.random(shape) < share for share in (0.5, 0.8))
+    given = matches, confidence, agreed, kinds, refined, correlated, reasons, sigma, 0.5, TRUST
     source, worth = label_origin(*given, threads)
     expected, expected_worth = label_origin_reference(*given)
     assert np.array_equal(source, expected)

@@ -188,16 +188,8 @@ def test_two_frames_at_once_give_the_bits_of_one_after_the_other(box):
 
 
 # Without subpixel fit, median and planes nothing else smooths.
-BARE = {
-    "superpixels": 200,
-    "min_superpixel_size": 1,
-    "subpixel_radius": 0,
-    "median_size": 0,
-    "plane_weight": 0,
-    "plane_fill": False,
-    "fill": False,
-    "support": False,
-}
+UNPLANED = {"superpixels": 200, "min_superpixel_size": 1, "plane_weight": 0, "plane_fill": False}
+BARE = UNPLANED | {"subpixel_radius": 0, "median_size": 0, "fill": False, "support": False}
 
 
 def test_the_bilateral_filter_removes_noise_and_keeps_the_step(box):
