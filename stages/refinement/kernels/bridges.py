@@ -3,7 +3,7 @@
 Holes are filled from the background (`holes`), because most of them are hidden from the right camera. The flank of a
 boulder leaves a hole as well: its disparity changes too fast for the windows of a match. A hidden hole is as wide as
 the step of disparity between its ends. Of a wider hole the right camera sees a part, so the images can decide: where
-they contradict the background and fit the line better, the hole takes the line.
+they contradict the background and fit the line better, the hole takes the line. That is a guess, never a measurement.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from stages.compiled.jit import kernel, part
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
-from stages.refinement.kernels.holes import KEPT, MIN_SURFACE_STEP, MISMATCH, OCCLUSION, OPEN
+from stages.refinement.kernels.holes import BRIDGE, KEPT, MIN_SURFACE_STEP, OCCLUSION, OPEN
 
 F32 = np.float32
 MIN_LENGTH = 4  # px, of a hole; in a shorter one the images decide little
@@ -28,7 +28,7 @@ PARTS = 16  # of a pixel; whole numbers sum to the same in any order
 def bridge_holes(
     disparity: Array, filled: Array, kinds: Array, left: Array, right: Array, threads: int = 1
 ) -> tuple[Array, Array]:
-    """`filled` and `kinds` with bridges, which have the kind `MISMATCH`; both arrays are changed.
+    """`filled` and `kinds` with bridges, which have the kind `BRIDGE`; both arrays are changed.
 
     disparity: (H, W) float32, px, NaN = hole; filled, kinds: as `fill_holes` returns them; left, right: (H, W) uint8.
     """
@@ -95,7 +95,7 @@ def _bridge(disparity, left, right, begin, stop, filled, kinds):
             if _is_bridge(disparity, left, right, y, first, x, filled, kinds):
                 for i in range(first, x):
                     filled[y, i] = _on_line(disparity[y, first - 1], disparity[y, x], i - first + 1, x - first)
-                    kinds[y, i] = MISMATCH
+                    kinds[y, i] = BRIDGE
 
 
 def bridge_holes_reference(
@@ -127,7 +127,7 @@ def bridge_holes_reference(
             by_fill = _differences_reference(left_rows, right_rows, columns[seen], background[seen]).mean()
             by_line = _differences_reference(left_rows, right_rows, columns, line).mean()
             if by_fill > MIN_CONTRADICTION * PARTS and by_line < by_fill:
-                filled[y, columns], kinds[y, columns] = line, MISMATCH
+                filled[y, columns], kinds[y, columns] = line, BRIDGE
     return filled, kinds
 
 

@@ -19,7 +19,7 @@ from stages.refinement.kernels.valid_extent import Extent
 
 F32 = np.float32
 MIN_SURFACE_STEP = 2.0  # px of disparity between two surfaces
-KEPT, MISMATCH, OCCLUSION, OPEN = range(4)  # kinds of pixels: no hole, filled as either, not filled
+KEPT, MISMATCH, OCCLUSION, OPEN, BRIDGE = range(5)  # kinds of pixels: no hole, filled as either, not filled, bridged
 MIN_OCCLUDER_STEP = 1.0  # px of disparity by which an occluder is nearer
 FILL_QUANTILE = 0.3  # share of the weight at or below the disparity that a hole takes
 HALF_WEIGHT_DISTANCE = 32.0  # px at which a weight is half of that at distance 0

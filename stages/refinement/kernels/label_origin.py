@@ -10,7 +10,7 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, PixelOrigin
-from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION
+from stages.refinement.kernels.holes import BRIDGE, KEPT, OCCLUSION
 
 F32 = np.float32
 MATCH_CONFIDENCES = 0.5, 0.75, 1.0
@@ -38,11 +38,11 @@ def label_origin(
     """Source and confidence of each pixel, (H, W) uint8 codes of `PixelOrigin` and float32.
 
     matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32 of the matches; agreed:
-    (H, W) bool, pixels that a plane moved or filled; kinds: (H, W) uint8 of `holes.fill_holes`; refined: (H, W)
-    float32, the result; consistent: (H, W) bool, pixels where the images agree with it; reasons: (H, W) uint8, codes of
-    pixels that stay unknown; sigma: (H, W) float32, px, of the result, 0 = not stated; max_move: px that a MEASURED
-    pixel may differ from its match, beside two sigmas. A pixel that was filled or differs more is MEASURED where the
-    images agree with it and its sigma is stated.
+    (H, W) bool, pixels that a plane moved or filled; kinds: (H, W) uint8 of `fill_holes` and `bridge_holes`; refined:
+    (H, W) float32, the result; consistent: (H, W) bool, pixels where the images agree with it; reasons: (H, W) uint8,
+    codes of pixels that stay unknown; sigma: (H, W) float32, px, of the result, 0 = not stated; max_move: px that a
+    MEASURED pixel may differ from its match, beside two sigmas. A pixel that was filled or differs more is MEASURED
+    where the images agree with it and its sigma is stated; a bridged one never is.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
     steps = np.arange(256) / 255
@@ -69,7 +69,7 @@ def _label(
     backed, replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):
-            d, match = refined[y, x], matches[y, x]
+            d, match, kind = refined[y, x], matches[y, x], kinds[y, x]
             blur = np.int64(np.rint(min(sigma[y, x] * F32(SIGMA_STEPS), F32(255))))
             near = abs(d - match) <= max_move + F32(2) * sigma[y, x]
             if d != d:
@@ -80,15 +80,15 @@ def _label(
                 source[y, x] = MEASURED
                 step = np.int64(np.rint(min(max(confidence[y, x], F32(0)), F32(1)) * F32(255)))
                 worth[y, x] = tables[0 if agreed[y, x] else 1, step] * WITHIN[blur]
-            elif match != match and kinds[y, x] != OCCLUSION and consistent[y, x] and sigma[y, x] > 0:
+            elif match != match and kind != OCCLUSION and kind != BRIDGE and consistent[y, x] and sigma[y, x] > 0:
                 source[y, x], worth[y, x] = MEASURED, backed * WITHIN[blur]
             elif match == match:
                 source[y, x] = MEASURED if consistent[y, x] and sigma[y, x] > 0 else PLANE
                 worth[y, x] = replaced
-            elif kinds[y, x] == KEPT:
+            elif kind == KEPT:
                 source[y, x], worth[y, x] = PLANE, plane
             else:
-                source[y, x], worth[y, x] = FILLED, mismatch if kinds[y, x] == MISMATCH else occlusion
+                source[y, x], worth[y, x] = FILLED, occlusion if kind == OCCLUSION else mismatch
 
 
 def label_origin_reference(
@@ -104,8 +104,8 @@ def label_origin_reference(
     within = special.erf(SIGMA_STEPS / np.maximum(blur, 1) / np.sqrt(2))
     conditions = [
         np.isnan(refined), stayed & ~consistent, stayed & agreed, stayed,
-        np.isnan(matches) & (kinds != OCCLUSION) & consistent & (sigma > 0), np.isfinite(matches), kinds == KEPT,
-        kinds == MISMATCH,
+        np.isnan(matches) & ~np.isin(kinds, (OCCLUSION, BRIDGE)) & consistent & (sigma > 0), np.isfinite(matches),
+        kinds == KEPT, kinds != OCCLUSION,
     ]  # fmt: skip
     moved = np.where(consistent & (sigma > 0), MEASURED, PLANE)
     codes: list[Any] = [reasons.astype(int), FILLED, MEASURED, MEASURED, MEASURED, moved, PLANE, FILLED]

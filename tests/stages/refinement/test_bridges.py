@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.bridges import bridge_holes, bridge_holes_reference
-from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, fill_holes
+from stages.refinement.kernels.holes import BRIDGE, KEPT, MISMATCH, OCCLUSION, fill_holes
 from stages.refinement.kernels.valid_extent import extent
 
 GROUND, TOP = 10.0, 22.0
@@ -55,7 +55,7 @@ def test_a_flank_takes_the_line_between_its_ends():
     disparity, left, right = scene(LINE)
     filled, kinds = bridged(disparity, left, right)
     np.testing.assert_allclose(filled[:, FIRST:END], np.tile(LINE, (HEIGHT, 1)), atol=1e-5)
-    assert (kinds[:, FIRST:END] == MISMATCH).all()
+    assert (kinds[:, FIRST:END] == BRIDGE).all()
     assert (kinds[:, :FIRST] == KEPT).all()
 
 

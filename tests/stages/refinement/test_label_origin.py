@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.data import PixelOrigin
-from stages.refinement.kernels.holes import KEPT, MISMATCH, OCCLUSION, OPEN
+from stages.refinement.kernels.holes import BRIDGE, KEPT, MISMATCH, OCCLUSION, OPEN
 from stages.refinement.kernels.label_origin import Trust, label_origin, label_origin_reference
 
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.85, 0.83, 0.84, 0.58, 0.56)
@@ -18,7 +18,7 @@ def test_origin_and_confidence_equal_the_reference(height, width, seed, threads)
     matches = np.where(rng.random(shape) < 0.4, np.nan, rng.uniform(2, 9, shape)).astype(np.float32)
     refined = np.where(np.isnan(matches), 5, matches + rng.choice([0, 0.4, 0.5, 0.6, -3], shape)).astype(np.float32)
     refined[rng.random(shape) < 0.2] = np.nan
-    kinds = np.where(np.isnan(matches), rng.integers(0, 4, shape), KEPT).astype(np.uint8)
+    kinds = np.where(np.isnan(matches), rng.integers(0, BRIDGE + 1, shape), KEPT).astype(np.uint8)
     confidence = rng.uniform(-0.1, 1.1, shape).astype(np.float32)
     reasons = rng.choice(np.array([0, 4, 6, 10], np.uint8), shape)
     sigma = rng.choice([0, 0.1, 0.3, 2, 1e6], shape).astype(np.float32)
@@ -47,13 +47,13 @@ def test_every_origin_has_its_own_confidence():
     assert np.allclose(worth[0], [0.98, 0.86, 0.58, 0.83, 0.84, 0.58, 0.56, 0], atol=1e-3)
 
 
-def test_a_hole_that_the_images_support_is_measured_unless_it_is_hidden():
-    hole, own = np.full((1, 3), np.nan, np.float32), np.ones((1, 3), np.float32)
-    kinds = np.array([[KEPT, MISMATCH, OCCLUSION]], np.uint8)
-    supported, nothing = np.ones((1, 3), bool), np.zeros((1, 3), np.uint8)
-    sigma = np.full((1, 3), 0.2, np.float32)
+def test_a_hole_that_the_images_support_is_measured_unless_it_is_hidden_or_bridged():
+    hole, own = np.full((1, 4), np.nan, np.float32), np.ones((1, 4), np.float32)
+    kinds = np.array([[KEPT, MISMATCH, OCCLUSION, BRIDGE]], np.uint8)
+    supported, nothing = np.ones((1, 4), bool), np.zeros((1, 4), np.uint8)
+    sigma = np.full((1, 4), 0.2, np.float32)
     source, _ = label_origin(hole, own, supported, kinds, own, supported, nothing, sigma, 0.5, TRUST)
-    assert [PixelOrigin(code).name for code in source[0]] == ["MEASURED", "MEASURED", "FILLED"]
+    assert [PixelOrigin(code).name for code in source[0]] == ["MEASURED", "MEASURED", "FILLED", "FILLED"]
 
 
 def test_confidence_falls_with_sigma():
