@@ -93,7 +93,7 @@ def test_rows_are_taken_in_their_order(step):
     assert len(parts) == 3
 
 
-@given(st.sampled_from([16, 64, 128]), st.sampled_from([16, 64, 128]), st.integers(-200, 200))
+@given(st.sampled_from([16, 64, 96, 128]), st.sampled_from([16, 64, 96, 128]), st.integers(-200, 200))
 def test_moved_paths_keep_what_both_ranges_have(lanes, other_lanes, later):
     paths = np.random.default_rng(0).integers(0, 255, (5, lanes)).astype(np.uint8)
     moved = np.zeros(5 * other_lanes, np.uint8)
@@ -118,7 +118,7 @@ def test_disparities_are_those_of_a_search_without_the_rest_of_the_range(
     cuts = [0, *sorted(rng.choice(range(1, height), 3, replace=False).tolist()), height]
     ranges = []
     for top, end in itertools.pairwise(cuts):
-        lanes = int(rng.choice([n for n in (64, 128, whole) if n < disparities or n == whole]))
+        lanes = int(rng.choice([n for n in (*NARROW_LANES, whole) if n < disparities or n == whole]))
         first = 0 if lanes == whole else int(rng.integers(0, disparities - lanes + 1))
         ranges.append(Range(top, end, first, Width(lanes)))
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
