@@ -8,14 +8,15 @@ and patches that would hang in the air or lie under the ground.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
-from stages.cloud.kernels.outliers import SupportRule, median_slope, supported
-from stages.cloud.kernels.patches import connected_patches, depth_images, in_patches
+from stages.cloud.kernels.outliers import SupportRule, median_slope, supported, write_depths
+from stages.cloud.kernels.patches import connected_patches, in_patches
 from stages.data import Array, PointCloud
 from stages.stage import Stage, parameter
 
@@ -89,10 +90,11 @@ class Clean(Stage):
         Points beyond the crop count in the order of depth, because the sky begins above them.
         """
         rule = SupportRule(self._crop, MAX_DEVIATIONS, MAX_SLOPE_RATIO, MIN_AGREEING_SHARE, MIN_NEIGHBOURS)
-        kept = supported(cloud.points, cloud.sigma, cloud.pixel, np.flatnonzero(measured), shape, rule)
+        kept, inverse, tolerance = supported(
+            cloud.points, cloud.sigma, cloud.pixel, np.flatnonzero(measured), shape, rule
+        )
         far = np.flatnonzero(measured & (cloud.points[:, 2] > self._crop))
-        used = np.concatenate([kept, far])
-        inverse, tolerance = depth_images(cloud.points, cloud.sigma, cloud.pixel, used, shape, MAX_DEVIATIONS)
+        write_depths(cloud.points, cloud.sigma, cloud.pixel, far, MAX_DEVIATIONS, math.inf, inverse, tolerance)
         patch, sizes = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
         chosen = (sizes >= self.min_patch_share * len(kept)) & ~out_of_order(inverse, patch, sizes)
         return in_patches(kept, cloud.pixel.take(kept), patch, chosen)

@@ -15,10 +15,10 @@ from stages.compiled.jit import kernel
 from stages.data import Array
 
 # Eight neighbours in each of four rings of 1 to 4 px, so that a cloud of every 4th pixel has neighbours too.
-_RINGS = 4
+RINGS = 4
 _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1))
 OFFSETS = np.array(
-    [(ring * dv, ring * du) for ring in range(1, _RINGS + 1) for dv, du in _DIRECTIONS], dtype=np.int32
+    [(ring * dv, ring * du) for ring in range(1, RINGS + 1) for dv, du in _DIRECTIONS], dtype=np.int32
 )  # fmt: skip
 
 
@@ -34,20 +34,40 @@ class SupportRule(NamedTuple):
 
 def supported(
     points: Array, sigma: Array, pixel: Array, chosen: Array, shape: tuple[int, int], rule: SupportRule
-) -> Array:
+) -> tuple[Array, Array, Array]:
     """The points that lie on the same surface as enough of their neighbours in the image, of those `chosen`.
 
     points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; chosen: (M,) int64, indices; shape: (H, W) of the image. Returns indices, (K,) int64.
+    int32; chosen: (M,) int64, indices; shape: (H, W) of the image. Returns indices, (K,) int64, and the images of
+    `write_depths` that contain these points only, (H, W) float32 each.
     """
-    inverse = np.full((shape[0] + 2 * _RINGS, shape[1] + 2 * _RINGS), np.nan, np.float32)
-    _inverse_depth(points, pixel, chosen, int(shape[1]), rule.max_depth_range, inverse)
-    slope = rule.max_slope_ratio * median_slope(inverse[_RINGS:-_RINGS, _RINGS:-_RINGS])
-    rays = pixel_rays(points, pixel, chosen, int(shape[1]))
-    offsets = OFFSETS[:, 0] * inverse.shape[1] + OFFSETS[:, 1]
-    return _supported(  # type: ignore[no-any-return]
-        points, sigma, pixel, chosen, inverse, offsets.astype(np.int64), rule, slope, rays
+    inverse, tolerance = (np.full((shape[0] + 2 * RINGS, shape[1] + 2 * RINGS), x, np.float32) for x in (np.nan, 0))
+    inside = np.s_[RINGS:-RINGS, RINGS:-RINGS]
+    write_depths(
+        points, sigma, pixel, chosen, rule.max_deviations, rule.max_depth_range, inverse[inside], tolerance[inside]
     )
+    slope = rule.max_slope_ratio * median_slope(inverse[inside])
+    agreed = np.zeros(shape, np.bool_)
+    _agree(
+        inverse, tolerance, OFFSETS, np.float32(slope), np.float32(rule.min_agreeing_share), rule.min_neighbours, agreed
+    )
+    rays = pixel_rays(points, pixel, chosen, int(shape[1]))
+    kept = np.empty(len(chosen), np.int64)
+    kept = kept[: _keep(points, sigma, pixel, chosen, agreed.reshape(-1), rays, inverse[inside], kept)]
+    return kept, inverse[inside], tolerance[inside]
+
+
+def write_depths(
+    points: Array, sigma: Array, pixel: Array, chosen: Array, deviations: float, max_range: float, inverse: Array,
+    tolerance: Array,
+) -> None:  # fmt: skip
+    """Write the inverse depths of the points `chosen`, 1/m, and the differences that noise explains, into two images.
+
+    points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
+    int32; chosen: (M,) int64; deviations: standard deviations of a difference; max_range: m from the camera, of the
+    points that are written; into inverse, tolerance: (H, W) float32.
+    """
+    _write_depths(points, sigma, pixel, chosen, float(deviations) * np.sqrt(2.0), float(max_range), inverse, tolerance)
 
 
 def median_slope(inverse: Array) -> float:
@@ -83,52 +103,60 @@ def pixel_rays(points: Array, pixel: Array, chosen: Array, width: int) -> Array:
 
 
 @kernel
-def _inverse_depth(points, pixel, chosen, width, max_range, inverse):
-    """Write the inverse depth of the points within the range into an image with a border."""
+def _write_depths(points, sigma, pixel, chosen, factor, max_range, inverse, tolerance):
+    width = inverse.shape[1]
     for i in chosen:
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
         if z > 0.0 and x * x + y * y + z * z <= max_range * max_range:
             row = pixel[i] // width
-            inverse[row + _RINGS, pixel[i] - row * width + _RINGS] = 1.0 / z
+            col = pixel[i] - row * width
+            own = 1.0 / z
+            inverse[row, col], tolerance[row, col] = own, factor * sigma[i] * own * own
 
 
 @kernel
-def _supported(points, sigma, pixel, chosen, inverse, offsets, rule, slope, rays):
-    max_range, deviations, _, share, least = rule
-    stride = inverse.shape[1]
-    width = stride - 2 * _RINGS
-    flat = inverse.reshape(-1)
-    enough = int(np.ceil(share * len(offsets)))
-    keep = np.empty(chosen.size, np.int64)
-    kept = 0
-    for i in chosen:
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if not (z > 0.0 and x * x + y * y + z * z <= max_range * max_range):
+def _agree(inverse, tolerance, offsets, slope, share, least, agreed):
+    """Whether enough of the neighbours of each pixel agree; a row at a time, so that all its pixels share the work."""
+    height, width = agreed.shape
+    filled = np.zeros(inverse.shape[0], np.bool_)
+    for row in range(inverse.shape[0]):
+        filled[row] = (inverse[row] > np.float32(0)).any()
+    present, agreeing = np.empty((2, width), np.float32)
+    for row in range(height):
+        if not filled[row + RINGS]:
             continue
+        own, noise = inverse[row + RINGS, RINGS:], tolerance[row + RINGS, RINGS:]
+        present[:] = agreeing[:] = 0
+        for k in range(len(offsets)):
+            there = row + RINGS + offsets[k, 0]
+            if filled[there]:
+                beside, more = inverse[there, RINGS + offsets[k, 1] :], slope * np.float32(k // 8 + 1)
+                for x in range(width):
+                    apart = abs(beside[x] - own[x])  # NaN without one of the two
+                    present[x] += np.float32(1) if apart >= 0 else np.float32(0)
+                    agreeing[x] += np.float32(1) if apart <= noise[x] + more else np.float32(0)
+        for x in range(width):
+            agreed[row, x] = (present[x] >= least) & (agreeing[x] >= share * present[x])
+
+
+@kernel
+def _keep(points, sigma, pixel, chosen, agreed, rays, inverse, kept):
+    """Keep the points that agree and lie on their pixel's line of sight, erase the others, and return their number."""
+    width = inverse.shape[1]
+    count = 0
+    for i in chosen:
         row = pixel[i] // width
         col = pixel[i] - row * width
-        own = 1.0 / z
+        own = 1.0 / np.float64(points[i, 2])
         aside = 2.0 * abs(rays[1]) + 3.0 * sigma[i] * own
-        if abs(x * own - rays[0] - rays[1] * col) > aside or abs(y * own - rays[2] - rays[3] * row) > aside:
-            continue
-        noise = deviations * np.sqrt(2.0) * sigma[i] * own * own
-        here = (row + _RINGS) * stride + col + _RINGS
-        present = 0
-        agreeing = 0
-        for k in range(len(offsets)):
-            beside = flat[here + offsets[k]]
-            if not beside > 0.0:
-                continue
-            present += 1
-            if abs(beside - own) <= noise + slope * (k // 8 + 1):
-                agreeing += 1
-                # Enough for a full neighbourhood is enough for any. Nearly every ground point ends here.
-                if agreeing >= enough and present >= least:
-                    break
-        if present >= least and agreeing >= share * present:
-            keep[kept] = i
-            kept += 1
-    return keep[:kept]
+        across = abs(points[i, 0] * own - rays[0] - rays[1] * col)
+        down = abs(points[i, 1] * own - rays[2] - rays[3] * row)
+        if agreed[pixel[i]] and not (across > aside or down > aside):
+            kept[count] = i
+            count += 1
+        else:
+            inverse[row, col] = np.nan
+    return count
 
 
 def supported_reference(
@@ -148,10 +176,10 @@ def supported_reference(
     aside = 2 * abs(rays[1]) + 3 * sigma * own
     off_ray = np.abs(p[:, 0] * own - rays[0] - rays[1] * col) > aside
     off_ray |= np.abs(p[:, 1] * own - rays[2] - rays[3] * row) > aside
-    padded = np.pad(inverse, _RINGS, constant_values=np.nan)
+    padded = np.pad(inverse, RINGS, constant_values=np.nan)
     present, agreeing = np.zeros(len(p), int), np.zeros(len(p), int)
     for k, (dv, du) in enumerate(OFFSETS):
-        difference = np.abs(padded[row + dv + _RINGS, col + du + _RINGS] - own)
+        difference = np.abs(padded[row + dv + RINGS, col + du + RINGS] - own)
         present += np.isfinite(difference)
         agreeing += difference <= deviations * np.sqrt(2) * sigma * own**2 + slope * (k // 8 + 1)
     return chosen[near & ~off_ray & (present >= least) & (agreeing >= share * present)]  # type: ignore[no-any-return]

@@ -10,31 +10,10 @@ from __future__ import annotations
 import numpy as np
 
 from stages.compiled.jit import kernel, part
-from stages.compiled.union_find import join, root
+from stages.compiled.union_find import root
 from stages.data import Array
 
 _MAX_STEP = 4  # px to the next point: a cloud may contain only every 4th pixel
-
-
-def depth_images(
-    points: Array, sigma: Array, pixel: Array, kept: Array, shape: tuple[int, int], deviations: float
-) -> tuple[Array, Array]:
-    """Inverse depth, 1/m, of the points `kept` (M,) int64, and the difference that noise explains, as images.
-
-    points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; deviations: standard deviations. Returns two (H, W) float32 images, NaN without a point.
-    """
-    images = np.full((2, *shape), np.nan, np.float32)
-    _depth_images(points, sigma, pixel, kept, float(deviations) * np.sqrt(2.0), images.reshape(2, -1))
-    return images[0], images[1]
-
-
-@kernel
-def _depth_images(points, sigma, pixel, kept, factor, images):
-    for i in kept:
-        inverse = 1.0 / np.float64(points[i, 2])
-        images[0, pixel[i]] = inverse
-        images[1, pixel[i]] = factor * sigma[i] * inverse * inverse
 
 
 def connected_patches(inverse: Array, tolerance: Array, slope: float) -> tuple[Array, Array]:
@@ -44,9 +23,7 @@ def connected_patches(inverse: Array, tolerance: Array, slope: float) -> tuple[A
     inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference explained by
     noise, 1/m (of two points the larger one applies); slope: further difference allowed per pixel of distance, 1/m.
     """
-    return _connected_patches(  # type: ignore[no-any-return]
-        np.ascontiguousarray(inverse), np.ascontiguousarray(tolerance), float(slope)
-    )
+    return _connected_patches(inverse, tolerance, float(slope))  # type: ignore[no-any-return]
 
 
 @part
@@ -67,20 +44,24 @@ def _linked(inverse, tolerance, slope, row, col, up, left):
 def _connected_patches(inverse, tolerance, slope):
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
-    begun = 0
+    begun = own = 0
     for row in range(height):
         for col in range(width):
             i = row * width + col
             if not inverse[row, col] > 0.0:
                 parent[i] = -1
                 continue
-            parent[i] = i
             left = _linked(inverse, tolerance, slope, row, col, 0, 1)
             above = _linked(inverse, tolerance, slope, row, col, 1, 0)
-            if left >= 0:
-                parent[i] = root(parent, left)
-            if above >= 0:
-                join(parent, i, above)
+            if left < 0:
+                own = i
+            elif left < i - 1:  # else `own` is still the root of the pixel to the left
+                own = root(parent, left)
+            if above >= 0 and parent[above] != own:
+                other = root(parent, above)
+                low, high = min(own, other), max(own, other)
+                own, parent[high] = low, low
+            parent[i] = own
             begun += left < 0 and above < 0
     # Parents come before their children, so one pass in order numbers every root before its children.
     sizes = np.zeros(begun, np.int32)
