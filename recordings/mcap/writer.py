@@ -102,14 +102,13 @@ class Ros2Writer:
             if large:
                 self._writer.flush()
             if self._digests is not None and copy_of is None:
-                self._digests[topic].update(b"%d %d " % (stamp, len(data)))
-                self._digests[topic].update(data)
+                self._digests[topic].update(b"%d %d %d " % (stamp, len(data), isal_zlib.crc32(data)))
             self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
             if large:
                 self._writer.flush()
 
     def digests(self) -> dict[str, str]:
-        """Topic -> hexadecimal digest of its messages and stamps so far, if they are kept; without copied ones."""
+        """Topic -> hexadecimal digest of the stamps, lengths and CRC-32 of its messages so far; without copied ones."""
         return {topic: digest.hexdigest()[:32] for topic, digest in (self._digests or {}).items()}
 
     def attachment(self, name: str, media_type: str, content: bytes) -> None:

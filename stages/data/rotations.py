@@ -12,7 +12,7 @@ import numpy as np
 
 from stages.data.arrays import Array
 
-_ORTHONORMAL = 1e-12  # largest deviation of the products of a matrix's rows
+_ORTHONORMAL = np.eye(3) * 1e-5 + 1e-12  # largest deviations of the products of a matrix's rows from 1 and 0
 _SMALL_ANGLE = 1e-3  # rad, below which a series is used
 
 
@@ -40,7 +40,7 @@ def quaternion_of(matrix: Array) -> Array:
     """The quaternion (4,) of length 1 of the rotation nearest to a matrix (3, 3), which must not mirror."""
     if not np.linalg.det(matrix) > 0:
         raise ValueError(f"the matrix {matrix.tolist()} is no rotation: its determinant is not positive")
-    if not np.allclose(matrix @ matrix.T, np.eye(3), rtol=1e-5, atol=_ORTHONORMAL):
+    if not np.all(np.abs(matrix @ matrix.T - np.eye(3)) <= _ORTHONORMAL):
         left, _, right = np.linalg.svd(matrix)
         matrix = left @ right
     m = matrix.tolist()
