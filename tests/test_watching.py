@@ -23,10 +23,10 @@ def test_watching_needs_the_recording(traverse, tmp_path, refused):
     assert "watching needs the recording; leave out --no-rrd" in why
 
 
-def is_the_same(out, result):
-    return out.read_bytes() == result.read_bytes() and (
-        pictures(out.with_suffix(".rrd")) == pictures(result.with_suffix(".rrd"))
-    )
+def check_same(out, result):
+    assert roverflow("diff", out, result) == 0  # it prints what differs
+    assert out.read_bytes() == result.read_bytes()
+    assert pictures(out.with_suffix(".rrd")) == pictures(result.with_suffix(".rrd"))
 
 
 def replaced(monkeypatch, words):
@@ -51,7 +51,7 @@ def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, s
     out = tmp_path / "out.mcap"
     printed = said(0, "run", traverse, *SMALL, "-o", out, "--view").out
     assert f"No viewer (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in printed
-    assert is_the_same(out, result)
+    check_same(out, result)
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_a_viewer_that_stops_or_dies_changes_nothing(traverse, result, tmp_path,
         assert how == "--view" or not answers(port_of(started[0]))
         for process in started:
             send(process, signal.SIGKILL)
-    assert is_the_same(out, result)
+    check_same(out, result)
     assert seen.stat().st_size < 0.9 * out.with_suffix(".rrd").stat().st_size  # it did not see the rest
 
 
@@ -90,7 +90,7 @@ def test_a_viewer_that_stops_or_dies_changes_nothing(traverse, result, tmp_path,
 def test_a_served_run_writes_the_same_result_and_its_page_ends(traverse, result, tmp_path, said, monkeypatch):
     started, out = replaced(monkeypatch, lambda command: command), tmp_path / "out.mcap"
     assert "watch the run at http://127.0.0.1:" in said(0, "run", traverse, *SMALL, "-o", out, "--serve").out
-    assert is_the_same(out, result)
+    check_same(out, result)
     assert not answers(port_of(started[0]))
 
 
