@@ -23,7 +23,7 @@ from stages.stage import Stage, parameter
 MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
 MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the ground's
 MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image
-KNN_QUERY = 1 << 16  # points whose nearest neighbours are in memory at once
+KNN_QUERY = 1 << 14  # points whose nearest neighbours are in memory at once
 MIN_NEIGHBOURS = 4  # with fewer a point cannot be judged and is dropped
 
 
@@ -103,14 +103,14 @@ class Clean(Stage):
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""
         from scipy.spatial import cKDTree  # takes long to import, and only this method needs it
 
-        points = cloud.points.astype(np.float64)
-        near = np.flatnonzero(np.einsum("ij,ij->i", points, points) <= self._crop**2)
+        squares = np.einsum("ij,ij->i", cloud.points, cloud.points, dtype=np.float64)
+        near = np.flatnonzero(squares <= self._crop**2)
         if len(near) <= self.knn_neighbours:
             return near
-        tree, mean = cKDTree(points[near]), np.empty(len(near))
+        tree, mean = cKDTree(cloud.points[near]), np.empty(len(near))
         for first in range(0, len(near), KNN_QUERY):
             some = slice(first, first + KNN_QUERY)
-            distance, _ = tree.query(points[near[some]], k=self.knn_neighbours + 1, workers=1)
+            distance, _ = tree.query(tree.data[some], k=self.knn_neighbours + 1, workers=1)
             mean[some] = distance[:, 1:].mean(axis=1)
         kept: Array = near[mean <= mean.mean() + self.knn_max_deviations * mean.std()]
         return kept

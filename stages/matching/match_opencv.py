@@ -6,6 +6,7 @@ Matches whose partner lies outside the right image are dropped.
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
 
 import cv2
@@ -100,6 +101,7 @@ class MatchOpenCV(Stage):
             cv2.copyMakeBorder(image, 0, 0, before, after, cv2.BORDER_REPLICATE) for image in (left, right)
         )  # fmt: skip
         scale = (1 if left.ndim == 2 else 3) * self.block_size**2
+        _release_freed_memory()
         # A matcher keeps its buffers and is not re-entrant; a new one for each frame costs little.
         matcher = cv2.StereoSGBM.create(
             minDisparity=self.min_disparity, numDisparities=levels, blockSize=self.block_size,
@@ -121,6 +123,13 @@ class MatchOpenCV(Stage):
         source = np.select([unseen, found], [np.uint8(PixelOrigin.OUT_OF_VIEW), np.uint8(PixelOrigin.MEASURED)], source)
         pixels[~(found & in_view)] = np.nan
         return pixels, source
+
+
+def _release_freed_memory() -> None:
+    """Return free pages of the heap to the system (glibc only): StereoSGBM takes 0.9 GB of 1280x960 outside of it."""
+    release = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if release is not None:
+        release(0)
 
 
 def _texture(image: Array, block: int) -> Array:
