@@ -20,7 +20,7 @@ from stages.compiled.simd import Width
 from stages.data import Array, PixelOrigin
 
 MEASURED = int(PixelOrigin.MEASURED)
-RANGE_MARGIN = 4  # px to either side of the prior's disparities in a band
+RANGE_MARGIN = 8  # px to either side of the prior's disparities in a band
 OUTLIER_SHARE = 0.001  # of the prior of a range, at either end, is ignored: less than a speckle
 MIN_KNOWN_SHARE = 0.5  # of a band's pixels; with fewer known pixels, as in the sky, the bands around it count too
 NARROW_LANES = (64, 96, 128)  # of ranges shorter than the whole; each number is compiled at its first use
