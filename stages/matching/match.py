@@ -21,6 +21,7 @@ from stages.matching.denoise import denoised
 from stages.matching.far_rows import far_rows
 from stages.matching.image_noise import frame_noise
 from stages.matching.intensity import gray_pair
+from stages.matching.kernels.gradient import steep_slope
 from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
 from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, whole_range
 from stages.matching.kernels.semiglobal import Matches, match
@@ -185,7 +186,7 @@ class Match(Stage):
         guide = None
         if prior is not None:
             gain, left, right = self._noise_measures(prior, frame)
-            guide = self._prior_costs(prior, search, area, gain)
+            guide = *self._prior_costs(prior, search, area, gain), steep_slope(prior.pixels)
         excluded = None if prior is None else self._excluded(prior, search, area)
         found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
         if prior is not None and self.out_of_range == "prior" and not self.search_radius:

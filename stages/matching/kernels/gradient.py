@@ -2,9 +2,10 @@
 
 raw = 2 * (census bits that differ, 0..24) + 5 * min(|difference of dx| + |difference of dy|, 6)
 Census distinguishes textured patches at any exposure; the truncated gradient difference adds the amount of contrast,
-which census ignores. The sum over 3 columns (at most 234) and the binomial mean (1, 2, 1) over 3 rows fit a byte. The
-trick: only the column sums of the last two rows are kept, and those of the next row are computed when the sweep reaches
-it, so no cost is ever stored for the whole image.
+which census ignores. The sum over 3 columns (at most 234) and the binomial mean (1, 2, 1) over 3 rows fit a byte.
+Where a prior is steep, as on the flank of a rock, the mean follows it: the rows above and below count at disparities
+1 px to either side. The trick: only the column sums of the last two rows are kept, and those of the next row are
+computed when the sweep reaches it, so no cost is ever stored for the whole image.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from stages.compiled.simd import (
     minus_capped,
     plus,
     plus_capped,
+    shifted,
     store,
 )  # fmt: skip
 from stages.data import Array
@@ -35,6 +37,10 @@ PLANES = 5
 LANES = 64  # pixels at a time
 MAX_GRADIENT_DIFFERENCE = 6
 NO_GRADIENT = 128
+WORD = 8  # slopes that are looked at together
+SLOPE_REACH = 5  # rows to either side, between which a slope is measured
+MIN_RISE, MAX_RISE = 4.5, 10.0  # px between these rows; what rises more is a depth edge
+NOT_SEARCHED = 255  # cost beyond either end of the search range
 
 
 def gradients(image: Array, planes: Array, mirrored: bool = False) -> None:
@@ -91,6 +97,19 @@ def gradients_reference(image: Array, mirrored: bool = False) -> Array:
     return result
 
 
+def steep_slope(prior: Array) -> Array:
+    """Whether disparity rises steeply down the image (1), falls steeply (-1), or neither (0).
+
+    prior: (H, W) float32, px, NaN = unknown. Returns (H, W) int8, with columns of 0 up to a multiple of `WORD`.
+    """
+    height, columns = prior.shape
+    slope = np.zeros((height, -(-columns // WORD) * WORD), np.int8)
+    rise = prior[2 * SLOPE_REACH :] - prior[: -2 * SLOPE_REACH]
+    rises, falls = (rise > MIN_RISE) & (rise <= MAX_RISE), (rise < -MIN_RISE) & (rise >= -MAX_RISE)
+    np.subtract(rises, falls, out=slope[SLOPE_REACH:-SLOPE_REACH, :columns], dtype=np.int8)
+    return slope
+
+
 @part
 def smoothed_costs(inputs, unseen_cost, first_lane, ahead, column_sums, costs, width):
     """The costs of the row before row `ahead` of a sweep, all pixels and disparities: costs (W * n,) uint8.
@@ -120,6 +139,39 @@ def smoothed_costs(inputs, unseen_cost, first_lane, ahead, column_sums, costs, w
 
 
 @part
+def set_aside(slope, step, behind, spare, width):
+    """Copy what `follow_slope` needs of the row behind row y of a sweep, before `smoothed_costs` overwrites its sums.
+
+    slope: of row y; step: 1 for a sweep down, -1 for a sweep up; behind, spare: (W * n,) uint8.
+    """
+    n, words = lanes_in(width), slope.view(np.int64)
+    for i in range(words.size):
+        if words[i] != 0:
+            for x in range(WORD * i, WORD * (i + 1)):
+                if slope[x] != 0:
+                    store(spare, x * n, _moved(load(behind, x * n, width), step * slope[x]))
+
+
+@part
+def follow_slope(slope, step, spare, ahead, middle, costs, width):
+    """Smooth the costs of row y again where it is steep; ahead, middle: column sums of the next row and of row y."""
+    nothing, n, words = broadcast(0, width), lanes_in(width), slope.view(np.int64)
+    for i in range(words.size):
+        if words[i] != 0:
+            for x in range(WORD * i, WORD * (i + 1)):
+                if slope[x] != 0:
+                    ends = average(load(spare, x * n, width), _moved(load(ahead, x * n, width), -step * slope[x]))
+                    mean = average(ends, load(middle, x * n, width))
+                    store(costs, x * n, average(average(mean, nothing), nothing))
+
+
+@part
+def _moved(lanes, rise):
+    """The costs of a row, a row away from where disparities are `rise` (1 or -1) px larger, at its disparities."""
+    return shifted(lanes, NOT_SEARCHED, 1) if rise > 0 else shifted(lanes, NOT_SEARCHED, -1)
+
+
+@part
 def raw_costs(left, right, inputs, unseen_cost, x, i, width):
     """The costs of pixel x, not smoothed; arguments as in `census_costs`."""
     bits = differing_bits(left, right, x, i, width)
@@ -131,8 +183,13 @@ def raw_costs(left, right, inputs, unseen_cost, x, i, width):
     return in_view_costs(cost, inputs, unseen_cost, i, width)
 
 
-def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen_cost: int) -> Array:
-    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 5, W) uint8, not mirrored."""
+def smoothed_costs_reference(
+    left: Array, right: Array, lanes: int, minimum: int, unseen_cost: int, slope: Array | None = None
+) -> Array:
+    """All costs, (H, W, lanes) uint8, in plain numpy.
+
+    left, right: (H, 5, W) uint8, not mirrored; slope: (H, W), of `steep_slope`.
+    """
     bits = census_costs_reference(left[:, :DX], right[:, :DX], lanes, minimum, 0).astype(np.int64)
     columns = left.shape[2]
     left, right = left.astype(np.int64), right.astype(np.int64)
@@ -145,6 +202,12 @@ def smoothed_costs_reference(left: Array, right: Array, lanes: int, minimum: int
                 raw[:, x, lane] = 2 * bits[:, x, lane] + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
     wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
     three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
-    mean = ((three[:-2] + three[2:] + 1) // 2 + three[1:-1] + 1) // 2
+    above, below = three[:-2].copy(), three[2:].copy()
+    slope = np.zeros(raw.shape[:2], np.int8) if slope is None else slope
+    for y, x in zip(*np.nonzero(slope), strict=True):
+        rise = slope[y, x]
+        for row, later in ((above, rise), (below, -rise)):
+            row[y, x] = np.pad(row[y, x], 1, constant_values=NOT_SEARCHED)[1 - later : 1 - later + lanes]
+    mean = ((above + below + 1) // 2 + three[1:-1] + 1) // 2
     result: Array = (((mean + 1) // 2 + 1) // 2).astype(np.uint8)
     return result

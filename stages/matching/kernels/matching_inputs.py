@@ -16,6 +16,7 @@ from stages.matching.kernels.gradient import gradients
 from stages.matching.kernels.sgm_params import SgmParams
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
+NO_SLOPE = np.zeros((1, 0), np.int8)
 
 
 class MatchingInputs(NamedTuple):
@@ -29,6 +30,7 @@ class MatchingInputs(NamedTuple):
     in_view_to: int
     prior: Array  # (H, W) int32: where in `prior_costs` the costs of a pixel begin; or none
     prior_costs: Array  # (m,) uint8
+    slope: Array = NO_SLOPE  # of `gradient.steep_slope`, or none
 
 
 def matching_inputs(
@@ -36,10 +38,10 @@ def matching_inputs(
     right: Array,
     params: SgmParams,
     width: Width,
-    prior: tuple[Array, Array] | None = None,
+    prior: tuple[Array, ...] | None = None,
     run_both: Fork = in_turn,
 ) -> MatchingInputs:
-    """The planes of gray images, (H, W) uint8. prior: the result of `prior_cost.prior_costs`, or None."""
+    """The planes of gray images, (H, W) uint8. prior: as in `semiglobal.match`."""
     columns = left.shape[1]
     (left_planes, steps), right_planes = run_both(
         lambda: (_planes(left, params), brightness_steps(left)), lambda: _planes(right, params, width)

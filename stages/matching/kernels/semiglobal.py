@@ -27,7 +27,7 @@ from stages.compiled.simd import Width
 from stages.compiled.workspace import Workspace, Workspaces
 from stages.data import Array
 from stages.matching.kernels.aggregation import aggregate_row
-from stages.matching.kernels.gradient import smoothed_costs
+from stages.matching.kernels.gradient import follow_slope, set_aside, smoothed_costs
 from stages.matching.kernels.matching_inputs import MatchingInputs, matching_inputs
 from stages.matching.kernels.row_ranges import Range, by_range, lanes_for, move_paths
 from stages.matching.kernels.selection import find_partners, find_winners, fit_row, keep_costs
@@ -65,7 +65,7 @@ class Scratch(NamedTuple):
 
 
 def match(
-    left: Array, right: Array, params: SgmParams, prior: tuple[Array, Array] | None,
+    left: Array, right: Array, params: SgmParams, prior: tuple[Array, ...] | None,
     search: SearchWindows | list[Range], excluded: Array | None, threads: int, max_memory: int,
 ) -> Matches:  # fmt: skip
     """Disparities of a rectified pair of gray images.
@@ -75,7 +75,8 @@ def match(
     left, right
         (H, W) uint8.
     prior
-        The result of `prior_cost.prior_costs` for the first disparity searched at each pixel, or None.
+        The result of `prior_cost.prior_costs` for the first disparity searched at each pixel, and that of
+        `gradient.steep_slope`, or None.
     search
         The disparities searched at each pixel, or in each band of rows.
     excluded
@@ -109,7 +110,7 @@ def match(
 
 
 def _match_ranges(
-    left: Array, right: Array, params: SgmParams, prior: tuple[Array, Array] | None, ranges: list[Range],
+    left: Array, right: Array, params: SgmParams, prior: tuple[Array, ...] | None, ranges: list[Range],
     max_memory: int, layers: Layers, space: Workspace, run_both: Fork,
 ) -> None:  # fmt: skip
     """Write disparities, evidence and source into `layers`; memory outside the workspace is freed on return."""
@@ -128,7 +129,11 @@ def _sweep(inputs, params, layers, width, scratch, first_lane, top, paths, y, en
             smoothed_costs(inputs, params.unseen_cost, first_lane, ahead, scratch.column_sums, scratch.costs, width)
     while y != end:
         if params.gradient:
+            ahead, here = scratch.column_sums[y + step & 1], scratch.column_sums[y & 1]
+            slope = inputs.slope[y if inputs.slope.size > 0 else 0]
+            set_aside(slope, step, ahead, scratch.total, width)
             smoothed_costs(inputs, params.unseen_cost, first_lane, y + step, scratch.column_sums, scratch.costs, width)
+            follow_slope(slope, step, scratch.total, ahead, here, scratch.costs, width)
         aggregate_row(
             inputs, params, first_lane, scratch.costs, paths, y, step, sums, (y - origin) * stride, scratch.total,
             final, width,

@@ -182,8 +182,9 @@ def _smooth(inputs, first, y, rows, costs, width):
     above, below = rows[(y + 2) % 3], rows[(y + 1) % 3]
     for x in range(columns):
         own, here = load(rows[y % 3], _slot(x, width), width), first[y, x]
-        up = _or_own(above, x, here - first[north, x], own, width)
-        down = _or_own(below, x, here - first[south, x], own, width)
+        rise = inputs.slope[y, x] if inputs.slope.size > 0 else 0
+        up = _or_own(above, x, here - first[north, x] - rise, own, width)
+        down = _or_own(below, x, here - first[south, x] + rise, own, width)
         cost = average(average(average(average(up, down), own), nothing), nothing)
         store(costs, x * n, plus_capped(cost, load(inputs.prior_costs, inputs.prior[y, x], width)))
 
@@ -292,7 +293,7 @@ def match_windows_reference(inputs: MatchingInputs, params: SgmParams, windows: 
     costs = np.full(searched.shape, NOT_SEARCHED)
     np.put_along_axis(costs, lanes, _raw_costs_reference(inputs, params, first, n), axis=2)
     if params.gradient:
-        costs = _smoothed_reference(costs, searched)
+        costs = _smoothed_reference(costs, searched, inputs.slope)
     pull = inputs.prior_costs[inputs.prior[..., np.newaxis] + np.arange(n)]
     np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
     sums = sum(aggregate_reference(inputs.steps, params, costs, searched, sign) for sign in (1, -1))
@@ -315,15 +316,20 @@ def _raw_costs_reference(inputs: MatchingInputs, params: SgmParams, first: Array
     return np.where(inputs.outside[partner] > 0, params.unseen_cost, costs)
 
 
-def _smoothed_reference(raw: Array, searched: Array) -> Array:
+def _smoothed_reference(raw: Array, searched: Array, slope: Array) -> Array:
     """Means over 3x3 pixels; a pixel's own cost stands in for neighbours that were not searched."""
 
     def neighbours(costs: Array, axis: int) -> tuple[Array, Array]:
         pad = [(int(axis == k),) * 2 for k in range(3)]
         wide = np.where(np.pad(searched, pad, mode="edge"), np.pad(costs, pad, mode="edge"), -1)
         length = costs.shape[axis]
-        one, other = wide.take(range(length), axis), wide.take(range(2, length + 2), axis)
-        return np.where(one < 0, costs, one), np.where(other < 0, costs, other)
+        pair = wide.take(range(length), axis), wide.take(range(2, length + 2), axis)
+        if axis == 0:
+            for y, x in zip(*np.nonzero(slope), strict=True):
+                for row, later in zip(pair, (slope[y, x], -slope[y, x]), strict=True):
+                    row[y, x] = np.pad(row[y, x], 1, constant_values=-1)[1 - later :][: raw.shape[2]]
+        one, other = (np.where(row < 0, costs, row) for row in pair)
+        return one, other
 
     west, east = neighbours(raw, 1)
     three = west + raw + east

@@ -6,7 +6,15 @@ from numba import njit
 
 from stages.compiled.simd import Width, lanes_in, store
 from stages.matching.kernels.census import census, census_costs, census_costs_reference, census_reference
-from stages.matching.kernels.gradient import gradients, gradients_reference, smoothed_costs, smoothed_costs_reference
+from stages.matching.kernels.gradient import (
+    follow_slope,
+    gradients,
+    gradients_reference,
+    set_aside,
+    smoothed_costs,
+    smoothed_costs_reference,
+    steep_slope,
+)
 from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.sgm_params import SgmParams
@@ -26,12 +34,16 @@ def rows_of_census(inputs, unseen_cost, costs, width):
 
 @njit
 def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
-    height = costs.shape[0]
+    height, spare = costs.shape[0], np.empty(costs.shape[1], np.uint8)
     first = 0 if step > 0 else height - 1
     for ahead in (first - step, first):
         smoothed_costs(inputs, unseen_cost, 0, ahead, sums, costs[first], width)
     for i in range(height):
-        smoothed_costs(inputs, unseen_cost, 0, first + (i + 1) * step, sums, costs[first + i * step], width)
+        y = first + i * step
+        slope = inputs.slope[y if inputs.slope.size > 0 else 0]
+        set_aside(slope, step, sums[y + step & 1], spare, width)
+        smoothed_costs(inputs, unseen_cost, 0, y + step, sums, costs[y], width)
+        follow_slope(slope, step, spare, sums[y + step & 1], sums[y & 1], costs[y], width)
 
 
 def params_of(gradient, disparities, minimum):
@@ -79,12 +91,39 @@ def test_costs_are_those_of_the_references_at_every_pixel_and_disparity(images, 
         params = params_of(gradient, disparities, minimum)
         inputs = matching_inputs(left, right, params, width)
         if gradient:
-            expected = smoothed_costs_reference(*planes, lanes, minimum, params.unseen_cost)
-            for step in (1, -1):
-                costs[:] = 7
-                rows_smoothed(inputs, params.unseen_cost, costs, np.empty((2, 77 * lanes), np.uint8), step, width)
-                assert np.array_equal(costs.reshape(expected.shape), expected)
+            random = np.random.default_rng(3).integers(-1, 2, left.shape, np.int8)
+            for slope in (None, np.pad(random, ((0, 0), (0, 3)))):
+                expected = smoothed_costs_reference(*planes, lanes, minimum, params.unseen_cost, slope)
+                sloping = inputs if slope is None else inputs._replace(slope=slope)
+                for step in (1, -1):
+                    costs[:] = 7
+                    rows_smoothed(sloping, params.unseen_cost, costs, np.empty((2, 77 * lanes), np.uint8), step, width)
+                    assert np.array_equal(costs.reshape(expected.shape), expected)
         else:
             expected = census_costs_reference(*bits, lanes, minimum, params.unseen_cost)
             rows_of_census(inputs, params.unseen_cost, costs, width)
             assert np.array_equal(costs.reshape(expected.shape), expected)
+
+
+@pytest.mark.parametrize(("rise", "expected"), [(1.1, 0), (1, 1), (0.5, 1), (0.4, 0), (0, 0), (-0.5, -1), (-1.1, 0)])
+def test_a_prior_that_changes_by_half_a_pixel_to_one_a_row_is_steep(rise, expected):
+    prior = np.repeat(60 + rise * np.arange(40, dtype=np.float32)[:, np.newaxis], 3, axis=1)
+    prior[:, 1] = np.nan
+    slope = steep_slope(prior)[:, :3]
+    assert (slope[5:-5, [0, 2]] == expected).all()
+    assert not slope[:, 1].any()
+    assert not slope[:5].any()
+    assert not slope[-5:].any()
+    assert not steep_slope(prior[:10]).any()
+
+
+@pytest.mark.parametrize("rise", [1, -1])
+def test_costs_on_steep_ground_are_lower_where_the_mean_follows_it(rise):
+    right = np.concatenate([textured(21, 60, 4), np.zeros((21, 4))], axis=1).astype(np.uint8)
+    left = np.stack([np.roll(row, 20 + rise * (y - 10)) for y, row in enumerate(right)])
+    planes = [np.concatenate([census_reference(image), gradients_reference(image)], axis=1) for image in (left, right)]
+    flat, along = (
+        smoothed_costs_reference(*planes, 48, 0, 11, np.full(left.shape, slope)) for slope in (0, rise)
+    )  # fmt: skip
+    y, x = np.mgrid[3:18, 36:60]
+    assert along[y, x, 20 + rise * (y - 10)].mean() < flat[y, x, 20 + rise * (y - 10)].mean()

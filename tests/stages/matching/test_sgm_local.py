@@ -52,7 +52,8 @@ def test_disparities_evidence_and_costs_are_those_of_the_reference(gradient, dia
     begin = np.rint(prior - lanes / 2).astype(np.int32)
     first = np.minimum(np.maximum(begin, np.arange(columns) - columns + 1), np.arange(columns)).astype(np.int32)
     found = SearchWindows(first, Width(lanes))
-    guide = prior_costs((prior - first).astype(np.float32), 0, lanes, 0.5, 4.0)
+    slope = rng.integers(-1, 2, prior.shape, np.int8)
+    guide = *prior_costs((prior - first).astype(np.float32), 0, lanes, 0.5, 4.0), slope
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
     params = params_of(gradient, 64, 0)._replace(diagonals=diagonals, p2_table=table, uniqueness=1)
     inputs, layers = searched(images, params, found, guide, 1)
