@@ -11,6 +11,7 @@ from recordings.ros2.cdr import make
 from stages.data import Array, Transform
 
 _SCALARS = {bool: "std_msgs/msg/Bool", int: "std_msgs/msg/Int64", float: "std_msgs/msg/Float64"}
+_LARGEST = (1 << 63) - 1
 
 
 def is_image(array: Array) -> bool:
@@ -31,6 +32,8 @@ def message_of(value: Any, stamp: int, frame_id: str) -> Any:
     Images become sensor_msgs/Image, (N, 3) floats sensor_msgs/PointCloud2, other arrays std_msgs/Float64MultiArray or
     Int64MultiArray. Raises ValueError for anything else.
     """
+    if _beyond_64_bits(value):
+        raise ValueError("a whole number beyond 64 bits has no standard form")
     if type(value) in _SCALARS:
         return make(_SCALARS[type(value)], data=value)
     if isinstance(value, str):
@@ -41,6 +44,13 @@ def message_of(value: Any, stamp: int, frame_id: str) -> Any:
         return _array_message(value, stamp, frame_id)
     shown = f"an array of {value.dtype}" if isinstance(value, np.ndarray) else f"a value of type {type(value).__name__}"
     raise ValueError(f"{shown} has no standard form")
+
+
+def _beyond_64_bits(value: Any) -> bool:
+    """Whether a whole number, or one of an array, does not fit 64 bits with a sign, which the messages have."""
+    if isinstance(value, np.ndarray):
+        return value.dtype == np.uint64 and bool((value > _LARGEST).any())
+    return isinstance(value, int) and not -_LARGEST - 1 <= value <= _LARGEST
 
 
 def _array_message(array: Array, stamp: int, frame_id: str) -> Any:

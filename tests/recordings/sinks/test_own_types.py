@@ -142,6 +142,12 @@ def test_a_value_unlike_its_annotation_is_an_error(tmp_path):
         written(tmp_path / "out.mcap", {"own": dict}, {"own": {"a": b"raw"}})
 
 
+@pytest.mark.parametrize("value", [1 << 63, -(1 << 63) - 1, np.array([1, 1 << 63], np.uint64)])
+def test_a_whole_number_beyond_64_bits_is_an_error(tmp_path, value):
+    with pytest.raises(LogError, match="cannot write 'own': a whole number beyond 64 bits has no standard form"):
+        written(tmp_path / "out.mcap", {"own": type(value)}, {"own": value})
+
+
 @pytest.mark.parametrize(("kind", "why"), [
     (list[str], "a list of anything but numbers has no standard form"),
     (NDArray[np.complex64], "an array of complex64 has no standard form"),
