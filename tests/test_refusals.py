@@ -427,10 +427,14 @@ def test_an_unknown_pipeline_is_answered_with_templates_too(refused):
     assert printed.endswith("match_right, rover_disparity; did you mean 'rover_disparity'?\n")
 
 
-def test_a_result_log_needs_the_ending_of_a_log(traverse, tmp_path, refused):
-    why = refused("run", traverse, "-o", tmp_path / "out.txt")
+def test_an_output_needs_the_ending_of_its_kind(traverse, fast_result, tmp_path, refused):
+    out = tmp_path / "out.txt"
+    why = refused("run", traverse, "-o", out)
     assert why.endswith("out.txt is no name of a log; end it in .mcap\n")
-    assert refused("simulate", tmp_path / "out.txt") == why
+    assert refused("simulate", out) == why
+    assert "out.txt is no name of a report; end it in .html" in refused("report", fast_result, "-o", out)
+    why = refused("why", fast_result, "--at", "0", "--cell=2,0", "-o", out)
+    assert "out.txt is no name of a picture; end it in .png" in why
 
 
 def test_a_pair_of_numbers_may_begin_with_a_minus(result, traverse, tmp_path, said):

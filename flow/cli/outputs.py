@@ -12,6 +12,8 @@ from recordings.atomic_write import check_writable, written
 from recordings.containers.finding import RESULT_ENDING
 from recordings.sinks.overwrite import is_ours
 
+_ENDINGS = {"log": ".mcap", "report": ".html", "picture": ".png"}  # of the names of outputs
+
 
 def add_pipeline_options(sub: argparse.ArgumentParser) -> None:
     """Add -p and --set."""
@@ -64,7 +66,8 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
             raise UsageError(f"{path} has the name of a log; choose another for a {kind}")
         if path.exists() and not is_ours(path, kind):
             raise UsageError(f"{path} exists and is no {kind} of roverflow; choose another name or remove it")
-        if kind.endswith("log") and path.suffix.lower() != ".mcap":
-            raise UsageError(f"{path} is no name of a log; end it in .mcap")
+        noun = "log" if kind.endswith("log") else kind
+        if path.suffix.lower() != (ending := _ENDINGS.get(noun, path.suffix.lower())):
+            raise UsageError(f"{path} is no name of a {noun}; end it in {ending}")
         check_writable(path)
         taken.append(resolved)
