@@ -62,7 +62,7 @@ def test_the_change_that_would_turn_a_verdict_turns_it(traverse, fast_result, st
 
 
 def test_the_pixels_of_a_cell_have_the_disparities_of_the_result(traverse, fast_result, stamp):
-    _, (x, y), *_ = places(fast_result, stamp, Cell.FREE, 5)
+    _, (x, y), *_ = places(fast_result, stamp, Cell.FREE, 4)
     found = why(fast_result, AT, cell=(x, y), log=traverse)
     recorded = read_disparity(messages(fast_result, "/nav/disparity")[stamp]).ravel()[found.pixels]
     assert found.pixels.size > 3

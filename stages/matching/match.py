@@ -22,6 +22,7 @@ from stages.matching.far_rows import far_rows
 from stages.matching.image_noise import frame_noise
 from stages.matching.intensity import gray_pair
 from stages.matching.kernels.gradient import steep_slope
+from stages.matching.kernels.matching_inputs import NO_SLOPE
 from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
 from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, whole_range
 from stages.matching.kernels.semiglobal import Matches, match
@@ -113,6 +114,10 @@ class Match(Stage):
     weak_texture_gain: float = parameter(
         4.0, "factor of `prior_weight` where noise leaves a match uncertain by 1 px", low=1, high=MAX_GAIN
     )
+    follow_slopes: bool = parameter(
+        False, "smooth the cost along steep slopes of the prior: fewer errors at rocks, but matches reach farther over "
+        "ground that they hide",
+    )  # fmt: skip
     denoise: bool = parameter(
         False, "remove noise beyond 1.25 gray levels, as the image and the prior show it, from the images to match"
     )  # fmt: skip
@@ -186,7 +191,8 @@ class Match(Stage):
         guide = None
         if prior is not None:
             gain, left, right = self._noise_measures(prior, frame)
-            guide = *self._prior_costs(prior, search, area, gain), steep_slope(prior.pixels)
+            slope = steep_slope(prior.pixels) if self.follow_slopes else NO_SLOPE
+            guide = *self._prior_costs(prior, search, area, gain), slope
         excluded = None if prior is None else self._excluded(prior, search, area)
         found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
         if prior is not None and self.out_of_range == "prior" and not self.search_radius:

@@ -63,6 +63,22 @@ def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(slope, match, bord
     assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
 
 
+@pytest.mark.parametrize("search", [{}, {"search_radius": 4}])
+def test_a_steep_slope_has_fewer_errors_where_the_cost_follows_it(search):
+    frame, truth = slanted_pair(height=60, near=50.0, far=8.0)  # 0.7 px a row
+    noise = np.random.default_rng(0).normal(0, 25, frame.left.shape)
+    frame = replace(frame, left=np.clip(frame.left + noise, 0, 255).astype(np.uint8))
+    sources, sure = np.full(truth.shape, PixelOrigin.MEASURED, np.uint8), np.ones(truth.shape, np.float32)
+    prior = Disparity(frame.stamp, truth, sources, sure)
+    seen = np.arange(320) >= truth + 2
+
+    def bad(follow):
+        found = Match(disparities=64, prior_weight=0.1, follow_slopes=follow, **search)(frame, prior).pixels
+        return (~(np.abs(found - truth) <= 0.5))[seen].mean()
+
+    assert bad(True) < 0.8 * bad(False)
+
+
 @pytest.mark.parametrize("cost", COSTS)
 def test_disparities_are_not_drawn_to_whole_numbers(slope, cost):
     frame, truth = slope
