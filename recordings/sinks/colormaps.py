@@ -117,7 +117,7 @@ def shrunk(image: Array, max_width: int) -> Array:
     if step == 1:
         return image
     mean = image[: rows * step, : cols * step]  # whole squares: a size that OpenCV averages fast, above all by 2
-    for factor in (step // 2, 1) if step % 2 == 0 else (1,):
+    for factor in (step // 2, 1) if step > 2 and step % 2 == 0 else (1,):
         mean = cv2.resize(mean, (cols * factor, rows * factor), interpolation=cv2.INTER_AREA)
     return mean
 

@@ -157,6 +157,8 @@ class Match(Stage):
         super().__post_init__()
         if self.search_radius and self.band_height:
             raise ValueError("Match.band_height has no effect with Match.search_radius; set one of them to 0")
+        if self.follow_slopes and self.cost == "census":
+            raise ValueError("Match.follow_slopes has no effect with cost census; set it to false")
         max_cost, (p1, p2) = COSTS[self.cost].max_cost, self._penalties()
         if not p2 > p1:
             raise ValueError(f"Match.p2 must be above Match.p1 = {p1}, not {p2}")
@@ -168,11 +170,13 @@ class Match(Stage):
             raise ValueError(f"Match.p2 must be at most {MAX_BYTE - max_cost} with cost {self.cost}, not {p2}")
 
     def check_inputs(self, inputs: Collection[str]) -> None:
-        """Raise ValueError if a search near a prior has no prior among the `inputs`, names of ports."""
+        """Raise ValueError if a setting needs a prior that is not among the `inputs`, names of ports."""
         for name, unit in (("search_radius", "px"), ("band_height", "px"), ("max_prior_step", "m")):
             value = getattr(self, name)
             if value and "prior" not in inputs:
                 raise ValueError(f"Match.{name} = {value} {unit} needs a `prior`: connect one, or set {name} to 0")
+        if self.follow_slopes and "prior" not in inputs:
+            raise ValueError("Match.follow_slopes needs a `prior`: connect one, or set it to false")
 
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
         self._check(frame, prior)

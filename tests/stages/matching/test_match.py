@@ -348,6 +348,10 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
     small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
     with pytest.raises(ValueError, match=r"search_radius = 4 px needs a `prior`"):
         Match(search_radius=4)(frame)
+    with pytest.raises(ValueError, match=r"follow_slopes needs a `prior`"):
+        Match(follow_slopes=True)(frame)
+    with pytest.raises(ValueError, match="follow_slopes has no effect with cost census"):
+        Match(follow_slopes=True, cost="census")
     with pytest.raises(ValueError, match=r"prior must be a stages\.Disparity, not a ndarray"):
         Match()(frame, truth)
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
