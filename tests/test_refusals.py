@@ -261,6 +261,12 @@ def test_an_empty_log_path_is_refused_in_one_sentence(log, refused):
         assert " contains no recording (no .mcap, .db3, .bag file); give" in refused("run", log, *more)
 
 
+def test_a_log_given_twice_is_one_log(traverse, fast_result, tmp_path):
+    out = tmp_path / "out.mcap"
+    assert roverflow("run", traverse, traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
+    assert out.read_bytes() == fast_result.read_bytes()
+
+
 def test_a_link_to_itself_is_replaced_by_the_output(traverse, fast_result, tmp_path):
     out, other = tmp_path / "out.mcap", tmp_path / "other.mcap"
     out.symlink_to(other)
@@ -282,6 +288,13 @@ def test_an_impossible_number_is_refused(traverse, tmp_path, option, value, prin
         roverflow("run", traverse, "-o", tmp_path / "out.mcap", f"{option}={value}")
     assert caught.value.code == 2
     assert printed in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size", ["lots", "4", "0GB", "-1GB", "GB"])
+def test_an_impossible_amount_of_memory_is_refused(size, traverse, tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        roverflow("fleet", traverse, "--out", tmp_path / "out", f"--memory={size}")
+    assert f"must be a number above 0 with MB, GB or TB, such as 4GB, not '{size}'" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which nobody can write")

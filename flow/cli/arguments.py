@@ -47,6 +47,13 @@ def workers(text: str) -> int:
     return value
 
 
+def memory(text: str) -> str:
+    """An amount of memory, as Dask reads it."""
+    if not re.fullmatch(r"\d*\.?\d+ ?[MGT]i?B", text) or not float(re.split("[ MGT]", text)[0]):
+        raise argparse.ArgumentTypeError(f"must be a number above 0 with MB, GB or TB, such as 4GB, not '{text}'")
+    return text
+
+
 def seconds(text: str) -> float:
     """Seconds after a log's first message."""
     try:

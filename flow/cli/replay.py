@@ -67,7 +67,7 @@ def replay(
             "roverflow": product_version(),
             "pipeline": graph.text,
             "overrides": "\n".join(overrides),
-            "log": ", ".join(path.name for path in logs),
+            "log": ", ".join(path.name for path in dict.fromkeys(logs)),
             "log_digest": log_digest(files) if files else "",
             "start": "" if start is None else repr(float(start)),
             "end": "" if end is None else repr(float(end)),

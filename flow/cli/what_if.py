@@ -88,7 +88,7 @@ def run_variants(
             notes.append(f"note: the log has only {counted(part.frames, 'frame')} from there on, not {place[1]}")
         log.narrow(part.start, part.end)
         about = {
-            "roverflow": product_version(), "log": ", ".join(path.name for path in logs),
+            "roverflow": product_version(), "log": ", ".join(path.name for path in dict.fromkeys(logs)),
             "start": repr(part.first), "end": repr(part.end), "every": "",
         }  # fmt: skip
         sinks = tuple((label, _sink(graphs[label], variants, label, (changes[label], part.stamp))) for label in graphs)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from flow.cli.arguments import count, workers
+from flow.cli.arguments import count, memory, workers
 from flow.cli.outputs import add_pipeline_options
 from flow.cli.report import say
 from flow.contracts import counted
@@ -31,7 +31,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     one = "threads of each log; a process runs one log at a time (2)"
     sub.add_argument("--workers-per-log", type=workers, default=2, metavar="N", help=one)
     sub.add_argument("--processes", type=workers, metavar="N", help="worker processes (cores / workers per log)")
-    sub.add_argument("--memory", default="4GB", metavar="SIZE", help="memory at which a worker process ends (4GB)")
+    ends = "memory at which a worker process ends (4GB)"
+    sub.add_argument("--memory", type=memory, default="4GB", metavar="SIZE", help=ends)
     address = "scheduler of a Dask cluster that exists, tcp://... or tls://..."
     sub.add_argument("--cluster", metavar="ADDRESS", help=address)
     sub.add_argument("--dashboard", action="store_true", help="show Dask's dashboard on http://127.0.0.1:8787")
