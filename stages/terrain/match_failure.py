@@ -20,11 +20,14 @@ MIN_BARE_PIXELS = 4  # fewer have no contrast that could be measured
 def match_failure(cloud: PointCloud, grid: Grid) -> Array:
     """Codes of `MatchFailure` of the cells that contain points of a cloud of filled pixels, (rows, cols) float64, else
     NaN."""
-    count, total, squares = np.moveaxis(shade_statistics(cloud.points, cloud.colors, grid), 2, 0)
-    n = np.where(count > 0, count, np.nan)
-    mean = total / n
-    contrast = np.sqrt(np.maximum(squares / n - mean * mean, 0.0))
+    shades = shade_statistics(cloud.points, cloud.colors, grid)
+    found = shades[:, :, 0] > 0
+    count, total, squares = shades[found].T
+    mean = total / count
+    contrast = np.sqrt(np.maximum(squares / count - mean * mean, 0.0))
     bare = (contrast <= MAX_BARE_CONTRAST) & (count >= MIN_BARE_PIXELS)
-    conditions = [mean <= MAX_DARK, mean >= MIN_BURNT_OUT, bare, count > 0]
-    codes = [MatchFailure.DARK, MatchFailure.BURNT_OUT, MatchFailure.BARE, MatchFailure.OTHER]
-    return np.select(conditions, [float(code) for code in codes], np.nan)
+    conditions = [mean <= MAX_DARK, mean >= MIN_BURNT_OUT, bare]
+    causes = [MatchFailure.DARK, MatchFailure.BURNT_OUT, MatchFailure.BARE]
+    codes = np.full(grid.shape, np.nan)
+    codes[found] = np.select(conditions, [float(cause) for cause in causes], float(MatchFailure.OTHER))
+    return codes

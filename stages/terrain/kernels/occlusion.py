@@ -43,8 +43,9 @@ def _lower(ceiling, x, y, z, dx, dy, dz, length, raster):
         way = k / (4.0 * cells_per_metre)
         row, col = cell_of(x + dx * way, y + dy * way, raster)
         height = z + dz * way
-        if row >= 0 and not ceiling[row, col] <= height:
-            ceiling[row, col] = height
+        if row >= 0:  # without a branch on the height, which nothing predicts
+            lowest = ceiling[row, col]
+            ceiling[row, col] = lowest if lowest <= height else height
 
 
 @kernel

@@ -20,14 +20,14 @@ def staying_points(points: Array, sigma: Array, sensor: Transform, grid: Grid) -
     points: (N, 3) float32, m; sigma: (N,) float32, depth standard deviation, m; sensor: the camera in the points'
     frame. Returns (rows, cols) int32.
     """
-    counts = np.zeros((*grid.shape, 3), np.int32)
+    counts, least = np.zeros((*grid.shape, 3), np.int32), np.empty(grid.shape, np.int32)
     camera = sensor.translation, sensor.rotation[:, 2].copy()
-    _count(np.ascontiguousarray(points), np.ascontiguousarray(sigma), camera, grid.raster, counts)
-    return np.minimum(np.minimum(counts[:, :, 0], counts[:, :, 1]), counts[:, :, 2])
+    _count(np.ascontiguousarray(points), np.ascontiguousarray(sigma), camera, grid.raster, counts, least)
+    return least
 
 
 @kernel
-def _count(points, sigma, camera, raster, counts):
+def _count(points, sigma, camera, raster, counts, least):
     eye, axis = camera
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
@@ -37,6 +37,9 @@ def _count(points, sigma, camera, raster, counts):
             row, col = cell_of(points[i, 0] + stretch * x, points[i, 1] + stretch * y, raster)
             if row >= 0:
                 counts[row, col, move] += 1
+    for row in range(least.shape[0]):
+        for col in range(least.shape[1]):
+            least[row, col] = min(counts[row, col, 0], counts[row, col, 1], counts[row, col, 2])
 
 
 def staying_points_reference(points: Array, sigma: Array, sensor: Transform, grid: Grid) -> Array:
