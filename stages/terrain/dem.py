@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud, Transform
+from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.data.arrays import spanned
 from stages.stage import Stage, check_cells, check_level, parameter
-from stages.terrain.kernels.cell_gradient import gradient_and_curvature
+from stages.terrain.kernels.cell_layers import VarianceModel, cell_layers
 from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics, extent
 from stages.terrain.kernels.occlusion import occlusion_ceiling
 from stages.terrain.kernels.splats import splat_statistics
@@ -24,8 +24,6 @@ from stages.terrain.match_failure import match_failure
 MIN_SPLAT_CELLS = 0.5  # points with a shorter reach are not splatted
 MIN_SPLATS = 2  # in a cell without a point of its own
 SPLAT_COUNT = 0.5  # the count of such a cell: less than one point
-MIN_STAYING_POINTS = 6  # with fewer after a move of one sigma, a cell may rest on the pixels of its neighbours
-NOISE_IN_SCATTER = 0.5  # share of the points' noise that their scatter shows, because neighbours err alike
 SUMS = [FIGURES.index(name) for name in ("count", "sum", "sum_of_squares", "noise")]
 
 
@@ -84,32 +82,49 @@ class Voxelise(Stage):
     def __call__(self, cloud: PointCloud) -> ElevationMap:
         """The elevation map of a cloud in frame `level`."""
         check_level(self, cloud)
+        grid, layers = self.window(cloud)
+        placed = {}
+        for name, layer in layers.items():
+            placed[name] = np.full(self.whole.shape, 0 if name == "count" else np.nan, np.float32)
+            placed[name][grid.within] = layer
+        return ElevationMap(cloud.stamp, placed, self.resolution, grid.origin, LEVEL_FRAME)
+
+    @property
+    def whole(self) -> Grid:
+        """The grid of the map."""
         half = int(np.ceil(self.max_range / self.resolution - 1e-9))
-        origin = (-half * self.resolution, -half * self.resolution)
-        whole = Grid(self.resolution, origin, (2 * half, 2 * half), self.max_range)
+        corner = -half * self.resolution
+        return Grid(self.resolution, (corner, corner), (2 * half, 2 * half), self.max_range)
+
+    def window(self, cloud: PointCloud) -> tuple[Grid, dict[str, Array]]:
+        """The part of the grid that a levelled cloud shows, and its layers there, (rows, cols) float32."""
+        whole = self.whole
         measured, guessed = self._split(cloud)
-        ceiling, sensor = None, cloud.sensor
+        ceiling, staying, sensor = None, None, cloud.sensor
         if sensor is not None and cloud.shape is not None:
             ceiling = occlusion_ceiling(measured.points, measured.pixel, cloud.shape[1], sensor.translation, whole)
         grid = self._window(cloud, ceiling, whole)
-        within = tuple(slice(at, at + cells) for at, cells in zip(grid.first, grid.shape, strict=True))
-        layers = self._layers(self._splatted(_statistics(measured, grid), measured, grid), measured, grid)
+        figures = self._splatted(_statistics(measured, grid), measured, grid)
+        if sensor is not None:
+            staying = staying_points(measured.points, measured.sigma, sensor, grid)
+        layers = cell_layers(figures, staying, sensor, cloud.tilt_sigma, self._model, grid)
         empty = layers["count"] == 0
         if ceiling is not None:
-            layers["ceiling"] = ceiling = np.where(empty, ceiling[within], np.nan)
-            layers["occluded"] = np.where(empty, np.where(np.isfinite(ceiling), 1.0, np.nan), 0.0)
+            layers["ceiling"] = np.where(empty, ceiling[grid.within], np.nan).astype(np.float32)
+            hidden = np.isfinite(layers["ceiling"])
+            layers["occluded"] = np.where(hidden, 1, np.where(empty, np.nan, 0)).astype(np.float32)
         if guessed is not None:
             figures = _statistics(guessed, grid)
             with np.errstate(invalid="ignore", divide="ignore"):
-                layers["filled"] = np.where(empty, figures[:, :, 1] / figures[:, :, 0], np.nan)
-            layers["unmatched"] = np.where(empty, match_failure(guessed, grid), np.nan)
+                layers["filled"] = np.where(empty, figures[:, :, 1] / figures[:, :, 0], np.nan).astype(np.float32)
+            layers["unmatched"] = np.where(empty, match_failure(guessed, grid), np.nan).astype(np.float32)
         for value in self.percentiles:
             layers[f"percentile_{value:g}"] = cell_percentile(measured.points, value, grid)
-        placed = {}
-        for name, layer in layers.items():
-            placed[name] = np.full(whole.shape, 0 if name == "count" else np.nan, np.float32)
-            placed[name][within] = layer
-        return ElevationMap(cloud.stamp, placed, self.resolution, origin, LEVEL_FRAME)
+        return grid, layers
+
+    @property
+    def _model(self) -> VarianceModel:
+        return VarianceModel(**{name: getattr(self, name) for name in VarianceModel._fields})
 
     def _window(self, cloud: PointCloud, ceiling: Array | None, whole: Grid) -> Grid:
         """The part of the grid that contains the points, their splats and the lines of sight over empty cells."""
@@ -138,76 +153,12 @@ class Voxelise(Stage):
             return figures
         reach = self.splat_sigmas, min_reach, self.max_splat
         splats = splat_statistics(cloud.points, cloud.sigma, sensor, reach, grid, figures[:, :, 0] == 0)
-        reached = splats[:, :, 0] >= MIN_SPLATS
-        gained = splats[reached]
+        reached = np.flatnonzero(splats[:, :, 0] >= MIN_SPLATS)
+        gained = splats.reshape(-1, len(FIGURES)).take(reached, axis=0)
         gained[:, SUMS] *= SPLAT_COUNT / gained[:, :1]
-        figures[reached] = gained
+        figures.reshape(-1, len(FIGURES))[reached] = gained
         return figures
-
-    def _layers(self, figures: Array, cloud: PointCloud, grid: Grid) -> dict[str, Array]:
-        count, total, squares, minimum, maximum, noise = (figures[:, :, i] for i in range(len(FIGURES)))
-        empty = count == 0
-        n = np.where(empty, np.nan, count)
-        mean = total / n
-        scatter = np.maximum(squares / n - mean * mean, 0.0)
-        x, y = grid.middles
-        variance = self._variance(n, mean, scatter, noise / n, cloud, x, y)
-        more = {}
-        if cloud.sensor is not None:
-            interpolated = staying_points(cloud.points, cloud.sigma, cloud.sensor, grid) < MIN_STAYING_POINTS
-            more["interpolated"] = np.where(empty, np.nan, interpolated)
-            fall = self.resolution * _sight_fall(cloud.sensor, mean, x, y)
-            variance = variance + np.where(interpolated & _beside_hole(mean), self.sight_share * fall * fall, 0.0)
-        return {
-            "elevation": mean,
-            "minimum": np.where(empty, np.nan, minimum),
-            "maximum": np.where(empty, np.nan, maximum),
-            "count": count,
-            "variance": variance,
-            "common_variance": np.where(empty, np.nan, cloud.tilt_sigma**2 * (x * x + y * y)),
-            **more,
-        }
-
-    def _variance(
-        self, n: Array, mean: Array, scatter: Array, noise: Array, cloud: PointCloud, x: Array, y: Array
-    ) -> Array:
-        """Random variance of the cells' means; n, mean, scatter, noise (of depth): (rows, cols), NaN = empty."""
-        east, north, curvature = gradient_and_curvature(mean)
-        rise = east * east + north * north
-        noise = noise * _lever(cloud, mean, x, y, east / self.resolution, north / self.resolution) ** 2
-        uneven = np.maximum(scatter - rise / 12 - NOISE_IN_SCATTER * noise, 0.0)
-        return np.asarray(
-            noise * (self.systematic_share + np.minimum(1.0, self.correlated_points / n))
-            + self.scatter_share * uneven
-            + self.curvature_share * curvature * curvature
-            + np.where(_beside_hole(mean), self.rim_share * rise, 0.0)
-        )
 
 
 def _statistics(cloud: PointCloud, grid: Grid) -> Array:
     return cell_statistics(cloud.points, cloud.sigma, grid)
-
-
-def _beside_hole(height: Array) -> Array:
-    """Which cells (rows, cols) are empty or have an empty neighbour."""
-    known = np.pad(np.isfinite(height), 1)
-    in_row = known[:, :-2] & known[:, 1:-1] & known[:, 2:]
-    return np.asarray(~(in_row[:-2] & in_row[1:-1] & in_row[2:]))
-
-
-def _sight_fall(sensor: Transform, height: Array, x: Array, y: Array) -> Array:
-    """How far the line of sight to each cell (rows, cols) falls per metre of horizontal distance."""
-    eye = sensor.translation
-    with np.errstate(divide="ignore"):
-        return np.asarray((eye[2] - height) / np.hypot(x - eye[0], y - eye[1]))
-
-
-def _lever(cloud: PointCloud, height: Array, x: Array, y: Array, east: Array, north: Array) -> Array:
-    """Height error over (x, y) per metre of depth error on a slope (east, north); 1 if the camera is not known."""
-    if cloud.sensor is None:
-        return np.ones_like(height)
-    axis, camera = cloud.sensor.rotation[:, 2], cloud.sensor.translation
-    dx, dy, dz = x - camera[0], y - camera[1], height - camera[2]
-    depth = dx * axis[0] + dy * axis[1] + dz * axis[2]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.where(depth > 0, (dz - east * dx - north * dy) / depth, 1.0))

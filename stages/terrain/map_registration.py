@@ -5,6 +5,7 @@ Only heading and position come from the pose. Up comes from the inclinometer, be
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -99,22 +100,23 @@ def frame_grid(cloud: PointCloud, level: Transform, resolution: float, max_range
     rest = replace(level, translation=np.append(level.translation[:2] - cell * resolution, 0.0))
     points = transform_points(cloud.points, rest.rotation, rest.translation)
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
-    terrain = Voxelise(resolution=resolution, max_range=max_range)(replace(cloud, points=points, sensor=sensor))
-    rows, cols = _seen(terrain)
-    row = int(cell[1]) - terrain.shape[0] // 2 + rows.start
-    col = int(cell[0]) - terrain.shape[1] // 2 + cols.start
-    layers = {name: layer[rows, cols] for name, layer in terrain.layers.items()}
+    binning = Voxelise(resolution=resolution, max_range=max_range)
+    grid, layers = binning.window(replace(cloud, points=points, sensor=sensor))
+    rows, cols = _seen(layers)
+    half = binning.whole.shape[0] // 2
+    row, col = (int(cell[1 - axis]) - half + grid.first[axis] + (rows, cols)[axis].start for axis in (0, 1))
+    layers = {name: layer[rows, cols] for name, layer in layers.items()}
     for name in HEIGHTS & layers.keys():
         layers[name] = layers[name] + np.float32(level.translation[2])
-    origin = (col * resolution, row * resolution)
-    return FrameGrid(level, replace(terrain, layers=layers, origin=origin, frame_id=level.parent), row, col)
+    terrain = ElevationMap(cloud.stamp, layers, resolution, (col * resolution, row * resolution), level.parent)
+    return FrameGrid(level, terrain, row, col)
 
 
-def _seen(terrain: ElevationMap) -> Span:
+def _seen(layers: Mapping[str, Array]) -> Span:
     """Rows and columns of the cells with a height or a ceiling and of their neighbours."""
-    seen = np.isfinite(terrain.layers["elevation"])
-    if "ceiling" in terrain.layers:
-        seen |= np.isfinite(terrain.layers["ceiling"])
+    seen = np.isfinite(layers["elevation"])
+    if "ceiling" in layers:
+        seen |= np.isfinite(layers["ceiling"])
     return spanned(seen, 1)
 
 

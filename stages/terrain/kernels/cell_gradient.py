@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel
+from stages.compiled.jit import kernel, part
 from stages.data import Array
 
 
@@ -20,28 +20,37 @@ def gradient_and_curvature(heights: Array) -> Array:
     return _gradient_and_curvature(np.ascontiguousarray(heights))  # type: ignore[no-any-return]
 
 
+@part
+def _known(value):
+    return 0.0 if np.isnan(value) else value
+
+
+@part
+def _slope(before, here, after):
+    sides = 2 - np.isnan(before) - np.isnan(after)
+    return (_known(here - before) + _known(after - here)) / max(sides, 1)
+
+
+@part
+def gradient_at(heights, row, col):
+    """The three numbers of a known cell, without branches, because holes may be anywhere."""
+    here = heights[row, col]
+    west = heights[row, col - 1] if col > 0 else np.nan
+    east = heights[row, col + 1] if col + 1 < heights.shape[1] else np.nan
+    south = heights[row - 1, col] if row > 0 else np.nan
+    north = heights[row + 1, col] if row + 1 < heights.shape[0] else np.nan
+    found = 4 - np.isnan(west) - np.isnan(east) - np.isnan(south) - np.isnan(north)
+    total = _known(west) + _known(east) + _known(south) + _known(north)
+    return _slope(west, here, east), _slope(south, here, north), here - total / found if found else 0.0
+
+
 @kernel
 def _gradient_and_curvature(heights):
-    rows, cols = heights.shape
-    result = np.full((3, rows, cols), np.nan)
-    for row in range(rows):
-        for col in range(cols):
-            here = heights[row, col]
-            if np.isnan(here):
-                continue
-            total, found = 0.0, 0
-            for axis in range(2):
-                rise, sides = 0.0, 0
-                for sign in (-1, 1):
-                    r, c = row + sign * axis, col + sign * (1 - axis)
-                    if r < 0 or c < 0 or r >= rows or c >= cols or np.isnan(heights[r, c]):
-                        continue
-                    rise += sign * (heights[r, c] - here)
-                    total += heights[r, c]
-                    sides += 1
-                found += sides
-                result[axis, row, col] = rise / sides if sides else 0.0
-            result[2, row, col] = here - total / found if found else 0.0
+    result = np.full((3, *heights.shape), np.nan)
+    for row in range(heights.shape[0]):
+        for col in range(heights.shape[1]):
+            if not np.isnan(heights[row, col]):
+                result[:, row, col] = gradient_at(heights, row, col)
     return result
 
 

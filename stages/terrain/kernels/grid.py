@@ -12,6 +12,7 @@ import numpy as np
 
 from stages.compiled.jit import kernel, part
 from stages.data import Array
+from stages.data.arrays import Span
 
 FIGURES = ("count", "sum", "sum_of_squares", "minimum", "maximum", "noise")
 
@@ -30,6 +31,12 @@ class Grid(NamedTuple):
         """The same as numbers, for `cell_of`."""
         x0, y0 = map(float, self.origin)
         return (1.0 / self.resolution, x0, y0, float(self.max_range), *self.first, *self.shape)
+
+    @property
+    def within(self) -> Span:
+        """Rows and columns of the window in the whole grid."""
+        rows, cols = (slice(at, at + cells) for at, cells in zip(self.first, self.shape, strict=True))
+        return rows, cols
 
     @property
     def middles(self) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, MatchFailure, PixelOrigin, PointCloud, Tilt, Transform
 from stages.terrain.dem import Voxelise
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradient_and_curvature_reference
+from stages.terrain.kernels.cell_layers import LAYERS, VarianceModel, cell_layers, cell_layers_reference
 from stages.terrain.kernels.grid import (
     Grid,
     cell_statistics,
@@ -238,6 +239,18 @@ def test_gradient_kernel_equals_the_reference() -> None:
     heights = random.normal(0, 1, (20, 30))
     heights[random.random(heights.shape) < 0.4] = np.nan
     np.testing.assert_allclose(gradient_and_curvature(heights), gradient_and_curvature_reference(heights), atol=1e-12)
+
+
+@pytest.mark.parametrize("sensor", [SENSOR, None])
+def test_layers_kernel_equals_the_reference(sensor: Transform | None) -> None:
+    random, points = np.random.default_rng(7), scattered(7, 20000, 6.0).astype(np.float32)
+    figures = cell_statistics_reference(points, random.uniform(0, 0.05, len(points)), GRID)
+    staying = None if sensor is None else random.integers(0, 12, GRID.shape, np.int32)
+    arguments = figures, staying, sensor, 0.004, VarianceModel(4.0, 0.8, 0.2, 0.34, 0.15, 1.0), GRID
+    got, want = cell_layers(*arguments), cell_layers_reference(*arguments)
+    assert list(got) == list(LAYERS if sensor else LAYERS[:-1]) == list(want)
+    for name in got:
+        np.testing.assert_allclose(got[name], want[name], rtol=1e-6, err_msg=name)
 
 
 def test_occlusion_kernel_equals_the_reference() -> None:

@@ -69,7 +69,8 @@ def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch)
 
 def use_whole_frames(monkeypatch):
     """Let the grid of a frame keep the cells that it does not show."""
-    monkeypatch.setattr("stages.terrain.map_registration._seen", lambda terrain: (slice(0, 320), slice(0, 320)))
+    monkeypatch.setattr("stages.terrain.dem.Voxelise._window", lambda self, cloud, ceiling, whole: whole)
+    monkeypatch.setattr("stages.terrain.map_registration._seen", lambda layers: (slice(0, 320), slice(0, 320)))
 
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance(monkeypatch):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from stages.terrain.dem import _beside_hole
 from stages.terrain.features import _as_whole_obstacles
+from stages.terrain.kernels.cell_layers import _beside_hole
 
 SHAPES = [(0, 0), (0, 4), (1, 1), (40, 57)]
 
@@ -14,7 +14,8 @@ SHAPES = [(0, 0), (0, 4), (1, 1), (40, 57)]
 def test_cells_beside_holes_are_those_that_an_erosion_removes(shape):
     height = np.where(np.random.default_rng(3).random(shape) < 0.9, 1.0, np.nan)
     eroded = ndimage.binary_erosion(np.isfinite(height), np.ones((3, 3)))
-    assert np.array_equal(_beside_hole(height), ~eroded)
+    found = [_beside_hole.py_func(height, row, col) for row, col in np.ndindex(shape)]
+    assert np.array_equal(np.reshape(found, shape), ~eroded)
 
 
 @pytest.mark.parametrize("shape", SHAPES)
