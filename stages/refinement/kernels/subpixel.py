@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import kernel, part
+from stages.compiled.jit import inlined_part, kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
@@ -44,23 +44,34 @@ def fit_brightness(left: Array, right: Array, disparity: Array, radius: int, thr
 def _compare(left, right, disparity, radius, framed, first, end):
     """Disparity, difference of the images and mean gradient of rows first to end.
 
-    NaN without a partner, and in a frame of `radius` columns.
+    NaN without a partner, and in a frame of `radius` columns. The partners of a row are read first: so the compiler
+    vectorises the rest.
     """
     width = disparity.shape[1]
+    paired, shares = np.zeros(width, np.bool_), np.zeros(width, np.float32)
+    taps = np.zeros((4, width), np.uint8)  # of the spline in the right image
     framed[:, first:end] = np.nan
     for y in range(first, end):
+        there, levels, partners = disparity[y], left[y], right[y]
         for x in range(1, width - 1):
-            at = F32(x) - disparity[y, x]
-            if F32(1) <= at < F32(width - 2):
-                i = np.int64(at)
-                t = at - F32(i)
-                a, b, c, d = F32(right[y, i - 1]), F32(right[y, i]), F32(right[y, i + 1]), F32(right[y, i + 2])
-                one, two, three = c - a, F32(2) * a - F32(5) * b + F32(4) * c - d, F32(3) * (b - c) + d - a
-                value = b + F32(0.5) * t * (one + t * (two + t * three))
-                slope = F32(0.5) * (one + t * (F32(2) * two + F32(3) * t * three))
-                framed[0, y, x + radius] = disparity[y, x]
-                framed[1, y, x + radius] = F32(left[y, x]) - value
-                framed[2, y, x + radius] = F32(0.5) * (slope + F32(0.5) * (F32(left[y, x + 1]) - F32(left[y, x - 1])))
+            at = F32(x) - there[x]
+            paired[x] = F32(1) <= at < F32(width - 2)
+            if paired[x]:
+                before = np.int32(at)
+                shares[x] = at - F32(before)
+                for k in range(4):
+                    taps[k, x] = partners[np.uint64(before + k - 1)]
+        own, error, gradient = framed[0, y, radius:], framed[1, y, radius:], framed[2, y, radius:]
+        for x in range(1, width - 1):
+            a, b, c, d = F32(taps[0, x]), F32(taps[1, x]), F32(taps[2, x]), F32(taps[3, x])
+            one, two, three = c - a, F32(2) * a - F32(5) * b + F32(4) * c - d, F32(3) * (b - c) + d - a
+            t = shares[x]
+            value = b + F32(0.5) * t * (one + t * (two + t * three))
+            slope = F32(0.5) * (one + t * (F32(2) * two + F32(3) * t * three))
+            slope = F32(0.5) * (slope + F32(0.5) * (F32(levels[x + 1]) - F32(levels[x - 1])))
+            own[x] = there[x] if paired[x] else F32(np.nan)
+            error[x] = F32(levels[x]) - value if paired[x] else F32(np.nan)
+            gradient[x] = slope if paired[x] else F32(np.nan)
 
 
 @kernel
@@ -85,7 +96,7 @@ def _move(framed, disparity, radius, moved, first, end):
                 after[x] = before[x] - min(max(step, -MAX_SHIFT), MAX_SHIFT) if count >= least else before[x]
 
 
-@part
+@inlined_part
 def _add(own, disparity, error, gradient, sums):
     """Add one pixel of each of `LANES` windows to its sums of 1, g, e, g g, g e, if its disparity is similar.
 
