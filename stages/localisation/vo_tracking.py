@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.compiled.hamming import clear_partners
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
+from stages.localisation.kernels.projection import projected
 from stages.matching.intensity import eight_bit, gray
 from stages.robust_weights import tukey_weights
 
@@ -161,9 +162,8 @@ def _fitted(
     """The pose that fits points (N, 3) to their pixels (N, 2), by Gauss-Newton with Tukey's weights."""
     pose = np.concatenate([turn.ravel(), shift.ravel()])
     for _ in range(FIT_ROUNDS):
-        at, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], matrix, None)
-        errors = (found - at.reshape(-1, 2)).ravel()
-        jacobian = jacobian[:, :6]
+        at, jacobian = projected(points, pose[:3], pose[3:], matrix)
+        errors = (found - at).ravel()
         sizes = np.linalg.norm(errors.reshape(-1, 2), axis=1)
         scale = max(float(np.median(sizes)) / 1.1774, MIN_PATCH_SIGMA)  # median of a Rayleigh distribution
         weights = tukey_weights(sizes, scale)
