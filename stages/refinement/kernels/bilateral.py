@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.compiled.jit import fast_kernel, kernel
+from stages.compiled.jit import fast_kernel, fast_part, kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
@@ -67,20 +67,25 @@ def _filter(values, levels, spatial, first, end, filtered):
         weights[:] = F32(0)
         for down in range(max(-radius, -y), min(radius, height - 1 - y) + 1):
             for across in range(max(-radius, 1 - width), min(radius, width - 1) + 1):
-                tap = spatial[down + radius, across + radius]
-                if tap == 0:
-                    continue
-                start, stop = max(0, -across), min(width, width - across)
-                centre, near = values[y, start:stop], values[y + down, start + across : stop + across]
-                level, near_level = levels[y, start:stop], levels[y + down, start + across : stop + across]
-                s, w = sums[start:stop], weights[start:stop]
-                for i in range(stop - start):
-                    e, g = near[i] - centre[i], near_level[i] - level[i]
-                    weight = tap / ((F32(1) + e * e) * (F32(1) + g * g))
-                    s[i] += weight * near[i]
-                    w[i] += weight
+                tap, start = spatial[down + radius, across + radius], max(0, -across)
+                if tap > 0:
+                    _add(
+                        values[y], values[y + down], levels[y], levels[y + down], np.uint64(start),
+                        np.uint64(start + across), np.uint64(width - abs(across)), tap, sums, weights,
+                    )  # fmt: skip
         for x in range(width):
             filtered[y, x] = sums[x] / weights[x]  # a pixel's own weight is 1
+
+
+@fast_part
+def _add(centres, values, levels, near_levels, start, near, count, tap, sums, weights):
+    """Add one neighbour of `count` pixels of a row: those from `near` on to those from `start` on."""
+    for i in range(count):
+        here, there = start + i, near + i
+        e, g = values[there] - centres[here], near_levels[there] - levels[here]
+        weight = tap / ((F32(1) + e * e) * (F32(1) + g * g))
+        sums[here] += weight * values[there]
+        weights[here] += weight
 
 
 def joint_bilateral_reference(disparity: Array, guide: Array, radius: int, every: bool) -> Array:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.compiled.jit import kernel, part
+from stages.compiled.jit import inlined_part, kernel
 from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.refinement.kernels.colours import levels_apart, packed
@@ -112,7 +112,7 @@ def _count_steps(disparity, first, holes, sign, steps):
                 steps[ray, i] = taken
 
 
-@part
+@inlined_part
 def _occlusion_limit(row, bound):
     """bound becomes, per pixel of a row, the disparity below which the right camera does not see it."""
     hidden = -NO_VALUE
@@ -123,7 +123,7 @@ def _occlusion_limit(row, bound):
         bound[x] = hidden
 
 
-@part
+@inlined_part
 def _read_ray(disparity, colour, y, columns, down, across, steps, values, colours):
     """First disparity on one ray from each hole of a row, inf = none, and the colour behind it."""
     height, width = disparity.shape
@@ -135,7 +135,7 @@ def _read_ray(disparity, colour, y, columns, down, across, steps, values, colour
         colours[i] = colour[place_y, place_x]
 
 
-@part
+@inlined_part
 def _weigh_ray(own, hidden, max_distance, ray_weight, length, steps, colours, values, weights):
     """Weights of the disparities on one ray for holes of colours `own`; a value without weight becomes inf."""
     for i in range(own.size):
@@ -151,7 +151,7 @@ def _weigh_ray(own, hidden, max_distance, ray_weight, length, steps, colours, va
         values[i] = value if counts else NO_VALUE
 
 
-@part
+@inlined_part
 def _quantile(values, weights, total, share, least):
     """The weighted quantile `FILL_QUANTILE` of eight values per hole, inf where all weights are 0.
 
@@ -216,7 +216,7 @@ def _fill(disparity, colour, within, max_distance, margin, first, holes, steps, 
             kinds[y, x] = OCCLUSION if value < hidden[i] else MISMATCH
 
 
-@part
+@inlined_part
 def _row_value(left, right, before, after, value):
     """`value`, or the row's end on the same surface, interpolated where both ends are."""
     if abs(right - left) < F32(MIN_SURFACE_STEP):
