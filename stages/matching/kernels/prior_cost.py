@@ -7,6 +7,8 @@ Four tables serve priors in steps of a quarter pixel, for each weight; one of ze
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from stages.compiled.jit import kernel
@@ -31,16 +33,10 @@ def prior_costs(
     which the cost grows no more; threads: 2 share the work, with the same result; gain: what the weight is multiplied
     by in each block of 4 x 4 px, (rows, cols) float32, 1 to MAX_GAIN. Returns (H, W) int32 and (m,) uint8.
     """
-    far = (
-        lanes + int(np.ceil(max_distance)) + TABLE_MARGIN
-    )  # a prior so far outside the search range costs the same everywhere
-    length = 2 * far + lanes
-    place = np.arange(length) - far
-    phase = np.arange(PHASES)[:, np.newaxis] / PHASES
-    distance = np.minimum(np.abs(place - phase), max_distance)
-    gains = np.ones(1) if gain is None else np.linspace(1, MAX_GAIN, GAINS)
-    costs = np.clip(np.round(weight * gains[:, np.newaxis, np.newaxis] * distance), 0, 255)
-    table = np.concatenate([costs.ravel(), np.zeros(lanes)]).astype(np.uint8)
+    # A prior so far outside the search range costs the same everywhere.
+    far = lanes + int(np.ceil(max_distance)) + TABLE_MARGIN
+    length, gains = 2 * far + lanes, 1 if gain is None else GAINS
+    table = _table(lanes, far, weight, max_distance, gains)
     begin, least = np.empty(prior.shape, np.int32), np.broadcast_to(minimum, prior.shape)
     steps = np.zeros((0, 0), np.uint8)
     if gain is not None:
@@ -48,10 +44,21 @@ def prior_costs(
 
     def work(first: int, end: int) -> None:
         apart = np.subtract(prior[first:end], least[first:end], dtype=np.float32)
-        _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, steps, len(gains), first, begin[first:end])
+        _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, steps, gains, first, begin[first:end])
 
     by_bands(shared_by(threads), len(prior), work)
     return begin, table
+
+
+@lru_cache(maxsize=16)  # it takes as long as the rest for small images
+def _table(lanes: int, far: int, weight: float, max_distance: float, gains: int) -> Array:
+    """Costs by gain, phase and distance, then zeros: (m,) uint8."""
+    place = np.arange(2 * far + lanes) - far
+    phase = np.arange(PHASES)[:, np.newaxis] / PHASES
+    distance = np.minimum(np.abs(place - phase), max_distance)
+    factors = np.linspace(1, MAX_GAIN, gains)[:, np.newaxis, np.newaxis]
+    costs = np.clip(np.round(weight * factors * distance), 0, 255)
+    return np.concatenate([costs.ravel(), np.zeros(lanes)]).astype(np.uint8)
 
 
 @kernel
