@@ -204,23 +204,25 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
     fit = Fit(part, whole.noise)
     seconds = (part.stamps - evidence.stamps[0]) / 1e9
 
-    def misfit(late: float) -> float:
-        cameras = np.empty_like(part.cameras)
+    def misfits(*late: float) -> list[float]:
+        """With the tilt delayed by each of these times, s."""
+        cameras = np.empty((len(late), *part.cameras.shape))
         for stretch, spline in splines.items():
             inside = within[kept] == stretch
             if inside.any():
-                cameras[inside] = spline(seconds[inside] - late).as_matrix()
-        return fit.misfit(fit.ups, cameras)
+                turns = spline(np.subtract.outer(seconds[inside], late).T.ravel())  # at once: each call takes 0.1 ms
+                cameras[:, inside] = turns.as_matrix().reshape(len(late), -1, 3, 3)
+        return [fit.misfit(fit.ups, each) for each in cameras]
 
     step = 0.05
     times = np.arange(-MAX_OFFSET, MAX_OFFSET + step / 2, step)
-    costs = np.array([misfit(float(late)) for late in times])
+    costs = misfits(*times)
     lowest = int(np.clip(np.argmin(costs), 1, len(times) - 2))
     low, middle, high = costs[lowest - 1 : lowest + 2]
     curvature = max((low - 2 * middle + high) / step**2, 1e-9)
     late = float(np.clip(times[lowest] - (high - low) / (2 * step) / curvature, -MAX_OFFSET, MAX_OFFSET))
-    misfit_best = misfit(late)
-    gained = misfit(0.0) - misfit_best
+    misfit_best, misfit_sound = misfits(late, 0.0)
+    gained = misfit_sound - misfit_best
     fault = f"the tilt's stamps are {abs(late) * 1000:.0f} ms {'late' if late > 0 else 'early'}"
     remedy = "Check the clocks of camera and inclinometer, and delays in the driver."
     return Cause(

@@ -197,10 +197,11 @@ def _ground_normal(cloud: PointCloud) -> Array:
     weights = np.ones(len(some))
     for _ in range(FIT_ROUNDS):
         centre = weights @ some / weights.sum()
-        offsets = (some - centre) * np.sqrt(weights)[:, None]
-        values, axes = np.linalg.eigh(offsets.T @ offsets / weights.sum())
+        offsets = some - centre
+        weighted = offsets * np.sqrt(weights)[:, None]
+        values, axes = np.linalg.eigh(weighted.T @ weighted / weights.sum())
         normal = axes[:, 0]
-        distance = (some - centre) @ normal
+        distance = offsets @ normal
         scale = max(MAD_TO_SIGMA * float(np.median(np.abs(distance))), MIN_GROUND_SIGMA)
         weights = tukey_weights(distance, scale) + 1e-9
     if values[1] < 4 * values[0]:  # not a plane
