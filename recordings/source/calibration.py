@@ -7,6 +7,7 @@ transforms of a log refer to the camera's own frame. So the rectified image has 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -34,7 +35,7 @@ class Camera:
     rectified: bool
     frame_id: str
 
-    @property
+    @cached_property
     def image_frame(self) -> str:
         """The frame of its rectified image: `frame_id`, or with a rotation R, `frame_id` and "_rectified"."""
         turned = not np.allclose(self.model.r, np.eye(3), rtol=0, atol=TRANSFORM_ATOL)
