@@ -175,6 +175,11 @@ def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x, outer, inner):
     assert (back.resolution, back.frame_id, back.stamp) == (cell, "odom", STAMP)
 
 
+def test_a_grid_map_without_cells_is_read_back():
+    message = grid_map(ElevationMap(STAMP, {"elevation": np.empty((0, 3), np.float32)}, 0.5, (0.0, 0.0), "odom"))
+    assert read_grid_map(message).shape == (0, 3)
+
+
 def test_an_occupancy_grid_starts_at_the_lower_left():
     message = occupancy_grid(navigation())
     assert (message.info.width, message.info.height) == (3, 2)
