@@ -8,7 +8,6 @@ before called ground, so a rock stands out of the ground instead of bending it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
 from typing import NamedTuple
 
 import cv2
@@ -17,13 +16,13 @@ import numpy as np
 from stages.data import Array, ElevationMap, Rover
 from stages.data.arrays import Span, spanned
 from stages.stage import Stage, parameter
+from stages.terrain.kernels.cell_steps import cell_steps
 from stages.terrain.kernels.local_minimum import local_minimum
 from stages.terrain.kernels.nearest_known import nearest_known
 from stages.terrain.kernels.plane_window import window_planes
 
 SURROUNDINGS = 2.5  # m, width of the window in which an obstacle stands out
 OBSTACLE_SHARE = 0.85  # of the rover's max_step, because cells blunt a peak
-MAX_EXTREME = 4.0  # how far an extreme counts, over the mean: one stray point is no step
 # Largest variance of a plane's height at the cell, over one cell's: four cells. No ratio of small integers equals it,
 # so rounding does not decide. Under a wheel there are few cells, and only the slope counts.
 _MAX_VARIANCE, _MAX_WHEEL_VARIANCE = 0.2503, 0.3503
@@ -42,7 +41,8 @@ class _Ground(NamedTuple):
     height: Array  # m, of the plane between the wheels
     wide: Array  # (3, rows, cols), planes of the surroundings
     under: Array  # (3, rows, cols), planes under the footprint
-    between: Array  # (3, rows, cols), planes between the wheels; NaN in cells that are not ground
+    between: Array  # (3, rows, cols), planes between the wheels
+    known: Array  # bool, cells of the ground whose plane between the wheels is known
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,8 @@ class TerrainFeatures(Stage):
         }
         if "ceiling" in elevation.layers:
             hidden = ~observed & np.isfinite(elevation.layers["ceiling"])
-            expected = np.fmax(ground.wide[0][hidden], _extrapolated(ground.between, hidden, elevation.resolution))
+            extrapolated = _extrapolated(ground.between, ground.known, hidden, elevation.resolution)
+            expected = np.fmax(ground.wide[0][hidden], extrapolated)
             layers["drop"] = np.full(height.shape, np.nan)
             layers["drop"][hidden] = expected - elevation.layers["ceiling"][hidden]
         return layers
@@ -141,7 +142,7 @@ class TerrainFeatures(Stage):
         local = window_planes(height, ground, narrow, _MAX_VARIANCE)
         under = local if footprint == narrow else window_planes(height, ground, footprint, _MAX_VARIANCE, observed)
         level = np.where(np.isfinite(local[0]), local[0], around[0])
-        return _Ground(level, around[:3], under[:3], np.where(ground, local[:3], np.nan))
+        return _Ground(level, around[:3], under[:3], local[:3], ground & np.isfinite(local[0]))
 
     def _trend(self, slopes: Array, resolution: float) -> Array:
         """The slopes (2, rows, cols), rise per cell, limited to the rover's max_slope; 0 where unknown."""
@@ -155,23 +156,19 @@ class TerrainFeatures(Stage):
         height, observed, level = height[inside], observed[inside], ground.height[inside]
         trend = self._trend(ground.wide[1:, *inside], elevation.resolution)
         lowest, support = local_minimum(height, observed, trend, _cells(self.rover.wheel, elevation.resolution))
-        extremes = (elevation.layers.get(name) for name in ("maximum", "minimum"))
-        top, bottom = (_finite(None if layer is None else layer[inside], height) for layer in extremes)
-        rise = np.minimum(top - lowest, MAX_EXTREME * (height - lowest))
-        above = np.minimum(top - level, MAX_EXTREME * (height - level))
-        below = np.minimum(level - bottom, MAX_EXTREME * (level - height))
-        explained = np.abs(trend).sum(axis=0)  # from one corner of a cell to the opposite one
-        within = np.minimum(top - bottom - explained, MAX_EXTREME * np.minimum(height - bottom, top - height))
-        step = reduce(np.fmax, [rise, above, below, within, np.zeros_like(height)])
+        top, bottom = (
+            elevation.layers.get(name, elevation.layers["elevation"])[inside] for name in ("maximum", "minimum")
+        )
+        step = cell_steps(height, observed, top, bottom, lowest, level, trend)
         raised = observed & ((np.abs(height - level) >= self.min_skirt_height) | (step >= self.min_obstacle_height))
-        return np.where(observed, _as_whole_obstacles(step, raised), np.nan), np.where(observed, support, np.nan)
+        return _as_whole_obstacles(step, raised), np.where(observed, support, np.nan)
 
 
-def _extrapolated(planes: Array, where: Array, resolution: float) -> Array:
-    """Least height of the nearest ground plane extrapolated to the cells `where`, (n,), NaN far from ground; planes:
-    (3, rows, cols) of height, m, and rise per cell along columns and rows."""
+def _extrapolated(planes: Array, known: Array, where: Array, resolution: float) -> Array:
+    """Least height of the nearest `known` plane extrapolated to the cells `where`, (n,), NaN far from it; planes: (3,
+    rows, cols) of height, m, and rise per cell along columns and rows."""
     rows, cols = np.nonzero(where)
-    row, col, distance = nearest_known(np.isfinite(planes[0]), rows, cols, _cells(_MAX_EXTRAPOLATION, resolution))
+    row, col, distance = nearest_known(known, rows, cols, _cells(_MAX_EXTRAPOLATION, resolution))
     near = distance * resolution <= _MAX_EXTRAPOLATION
     extrapolated = np.full(len(rows), np.nan)
     height, along, across = planes[:, row[near], col[near]]
@@ -194,11 +191,6 @@ def _slope(planes: Array, where: Array, resolution: float) -> Array:
     slope = np.full(where.shape, np.nan)
     slope[where] = np.arctan(np.hypot(planes[1][where], planes[2][where]) / resolution)
     return slope
-
-
-def _finite(layer: Array | None, height: Array) -> Array:
-    """A layer of heights as float64, with `height` where it is missing or not finite."""
-    return height if layer is None else np.where(np.isfinite(layer), layer, height).astype(np.float64)
 
 
 def _cells(distance: float, resolution: float) -> int:

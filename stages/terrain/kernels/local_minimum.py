@@ -12,6 +12,7 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.data import Array
+from stages.terrain.kernels.plane_window import span
 
 
 def local_minimum(heights: Array, use: Array, trend: Array, radius: int) -> tuple[Array, Array]:
@@ -23,13 +24,13 @@ def local_minimum(heights: Array, use: Array, trend: Array, radius: int) -> tupl
     Returns two (rows, cols) float64: that height, NaN where `use` is False; and the share of the disc's cells that
     count.
     """
-    shape = heights.shape
-    lowest, share = np.full(shape, np.nan), np.zeros(shape)
-    framed = np.pad(np.where(use, heights, np.inf), ((0, 0), (radius, radius)), constant_values=np.inf)
-    count = np.pad(np.cumsum(use, axis=1, dtype=np.int32), ((0, 0), (radius + 1, 0)))
-    count = np.pad(count, ((0, 0), (0, radius)), mode="edge")
-    disc = _disc(radius)
-    reach = np.array([disc[disc[:, 0] == row, 1].max() for row in range(-radius, radius + 1)])
+    rows, cols = heights.shape
+    framed, count = np.full((rows, cols + 2 * radius), np.inf), np.zeros((rows, cols + 2 * radius + 1), np.int32)
+    np.copyto(framed[:, radius : radius + cols], heights, where=use)
+    np.cumsum(use, axis=1, out=count[:, radius + 1 : radius + 1 + cols])
+    count[:, radius + 1 + cols :] = count[:, radius + cols, None]
+    reach = np.sqrt((radius + 0.3) ** 2 - np.arange(-radius, radius + 1) ** 2).astype(np.int64)
+    lowest, share = np.full(heights.shape, np.nan), np.zeros(heights.shape)
     _local_minimum(framed, count, np.ascontiguousarray(use), np.ascontiguousarray(trend), reach, lowest, share)
     return lowest, share
 
@@ -43,7 +44,7 @@ def _disc(radius: int) -> Array:
 
 @kernel
 def _local_minimum(heights, count, use, trend, reach, lowest, share):
-    """One offset at a time for a whole row, so that the loop is vectorised.
+    """One offset at a time for all cells of a row that are in use, so that the loop is vectorised.
 
     heights: inf where not in use, padded by `radius` columns; count: running sum of cells in use; reach: half width of
     the disc in each of its rows."""
@@ -52,23 +53,24 @@ def _local_minimum(heights, count, use, trend, reach, lowest, share):
     size = (2 * reach + 1).sum()
     minimum, found = np.empty(cols), np.empty(cols, np.int32)
     for row in range(rows):
+        begin, end = span(use[row])
         minimum[:] = np.inf
         found[:] = 0
-        east, north = trend[0, row], trend[1, row]
+        east, north = trend[0, row, begin:end], trend[1, row, begin:end]
         for other in range(max(row - radius, 0), min(row + radius + 1, rows)):
             far, y = reach[other - row + radius], np.float64(other - row)
-            before, after = count[other, radius - far :], count[other, radius + far + 1 :]
-            for col in range(cols):
+            before, after = count[other, begin + radius - far :], count[other, begin + radius + far + 1 :]
+            for col in range(east.size):
                 found[col] += after[col] - before[col]
             for offset in range(-far, far + 1):
-                beside, x = heights[other, radius + offset :], np.float64(offset)
-                for col in range(cols):
+                beside, x = heights[other, begin + radius + offset :], np.float64(offset)
+                for col in range(east.size):
                     height = beside[col] - east[col] * x - north[col] * y
                     minimum[col] = height if height < minimum[col] else minimum[col]
-        for col in range(cols):
-            if use[row, col]:
-                lowest[row, col] = minimum[col]
-                share[row, col] = found[col] / size
+        for col in range(east.size):
+            if use[row, begin + col]:
+                lowest[row, begin + col] = minimum[col]
+                share[row, begin + col] = found[col] / size
 
 
 def local_minimum_reference(heights: Array, use: Array, trend: Array, radius: int) -> tuple[Array, Array]:

@@ -56,7 +56,7 @@ def _window_planes(heights, use, where, radius, max_variance, planes):
     windows = np.empty((10, cols))
     first, stop = cols, 0  # the columns with cells that count; the sums of others stay 0
     for row in range(rows):
-        begin, end = _span(use[row])
+        begin, end = span(use[row])
         if begin < end:
             first, stop = min(first, begin), max(stop, end)
     for row in range(min(radius, rows)):
@@ -66,7 +66,7 @@ def _window_planes(heights, use, where, radius, max_variance, planes):
             _add_row(sums, heights, use, row + radius, 1.0, first, stop)
         if row - radius - 1 >= 0:
             _add_row(sums, heights, use, row - radius - 1, -1.0, first, stop)
-        begin, end = _span(where[row])
+        begin, end = span(where[row])
         if begin < end:
             _sum_up(sums, radius, windows, first, stop, begin, end)
             _solve(windows, row, begin, max_variance, planes[0, row][begin:end], planes[1, row][begin:end],
@@ -76,7 +76,7 @@ def _window_planes(heights, use, where, radius, max_variance, planes):
 
 
 @part
-def _span(cells):
+def span(cells):
     """The first cell of a row that is True and the one after the last; (0, 0) if there is none."""
     cols = cells.size
     for begin in range(cols):

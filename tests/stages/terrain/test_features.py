@@ -12,6 +12,7 @@ from scipy.ndimage import distance_transform_edt
 from stages.data import Array, Cell
 from stages.terrain.binarise import Binarise
 from stages.terrain.features import TerrainFeatures
+from stages.terrain.kernels.cell_steps import cell_steps, cell_steps_reference
 from stages.terrain.kernels.local_minimum import local_minimum, local_minimum_reference
 from stages.terrain.kernels.nearest_known import nearest_known, nearest_known_reference
 from stages.terrain.kernels.plane_window import window_planes, window_planes_reference
@@ -27,6 +28,17 @@ def test_local_minimum_kernel_equals_the_reference(seed: int, radius: int, share
     arguments = (heights, use, trend, radius)
     for got, want in zip(local_minimum(*arguments), local_minimum_reference(*arguments), strict=True):
         np.testing.assert_allclose(got, want, atol=1e-12)
+
+
+def test_steps_kernel_equals_the_reference() -> None:
+    random = np.random.default_rng(8)
+    height, lowest, ground, top, bottom = random.normal(0, 0.2, (5, 40, 50))
+    top, bottom, ground = height + np.abs(top), height - np.abs(bottom), np.where(ground > 0.2, np.nan, ground)
+    top[:5] = bottom[3:8] = np.nan
+    extremes = top.astype(np.float32), bottom.astype(np.float32)
+    trend, observed = random.normal(0, 0.02, (2, 40, 50)), random.random((40, 50)) < 0.7
+    arguments = height, observed, *extremes, np.minimum(lowest, height), ground, trend
+    np.testing.assert_array_equal(cell_steps(*arguments), cell_steps_reference(*arguments))
 
 
 @settings(max_examples=10, deadline=None)
