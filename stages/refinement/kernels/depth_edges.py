@@ -48,14 +48,16 @@ def sharpen_edges(
     """
     both = shared_by(threads)
     right = _exposed(disparity, guessed, left, right)
-    border = radius, radius, radius, radius, cv2.BORDER_CONSTANT
-    padded = cv2.copyMakeBorder(disparity, *border, value=np.nan)
-    matches = cv2.copyMakeBorder(np.where(guessed, F32(np.nan), disparity), *border, value=np.nan)
-    guide, other = packed(cv2.copyMakeBorder(left, *border, value=0)), packed(right)
+    height, width = disparity.shape
+    layers = np.full((2, height + 2 * radius, width + 2 * radius), np.nan, np.float32)  # all disparities, matches
+    padded, matches = layers
+    padded[radius : height + radius, radius : width + radius] = disparity
+    np.copyto(matches[radius : height + radius, radius : width + radius], disparity, where=~guessed)
+    guide = packed(cv2.copyMakeBorder(left, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=0))
     taps = _taps(radius) @ [padded.shape[1], 1]
-    window = np.stack([WINDOW @ [padded.shape[1], 1], WINDOW @ [disparity.shape[1], 1], WINDOW_WEIGHTS])
+    window = np.stack([WINDOW @ [padded.shape[1], 1], WINDOW @ [width, 1], WINDOW_WEIGHTS])
     weight = F32(ODDS_OF_WINDOW / len(taps) / UNIT)
-    given = padded, matches, guessed, guide, other, window, taps, _weights(colour), weight, radius, F32(jump)
+    given = layers, guessed, guide, packed(right), window, taps, _weights(colour), weight, radius, F32(jump)
     asked, moved, sharp = np.empty(disparity.shape, bool), np.empty(disparity.shape, bool), disparity.copy()
     by_bands(both, len(disparity), lambda first, end: _find_jumps(padded, radius, F32(jump), asked, first, end))
     for _ in range(PASSES):
@@ -116,16 +118,15 @@ def _mark_jumps(above, row, below, jump, found):
 
 
 @kernel
-def _sharpen(
-    disparity, matches, guessed, guide, right, window, taps, table, weight, radius, jump, asked, sharp, moved,
-    first, end,
-):  # fmt: skip
-    """Sharpen the pixels of rows first to end that are asked; disparity, matches and guide have a border.
+def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius, jump, asked, sharp, moved, first, end):
+    """Sharpen the pixels of rows first to end that are asked; layers and guide have a border.
 
-    They are decided in batches, whose pixels lie side by side in the work arrays.
+    layers: disparities for guesses, and those of matches for matches. The pixels are decided in batches, in which they
+    lie side by side in the work arrays. An array that depends on the pixel would be counted for each, which takes as
+    long as all the rest.
     """
-    stride, columns = disparity.shape[1], np.empty(sharp.shape[1] + 1, np.int64)
-    everything, certain, count = disparity.reshape(-1), matches.reshape(-1), 0
+    stride, columns, count = layers.shape[2], np.empty(sharp.shape[1] + 1, np.int64), 0
+    known, size = layers.reshape(2, -1), right.shape
     places, sides = np.empty((3, BATCH), np.int64), np.empty((2, BATCH), np.float32)
     # Side by side: disparities and colours of the taps, the middle disparity, the own colour, weights and votes; the
     # colours that the images have in the window, the fractions, whether it lies inside, and how much they differ
@@ -135,14 +136,15 @@ def _sharpen(
         np.empty((window.shape[1], 5, BATCH), np.uint32), np.empty((2, BATCH), np.uint32), np.empty(BATCH, np.bool_),
         np.empty(BATCH, np.int32),
     )  # fmt: skip
-    given = everything, certain, guessed, guide.reshape(-1), right, window, taps, table, weight, stride, places, sides
+    given = (
+        known, guessed, guide.reshape(-1), right.reshape(-1), size, window, taps, table, weight, stride, places, sides
+    )  # fmt: skip
     for y in range(first, end):
         for n in range(_listed(asked[y], columns)):
             x = columns[n]
-            flat = everything if guessed[y, x] else certain
-            at = np.int64((y + radius) * stride + x + radius)
-            low, high = _candidates(flat, at, stride)
-            if max(high - flat[at], flat[at] - low) > jump:
+            layer, at = np.uint64(not guessed[y, x]), np.int64((y + radius) * stride + x + radius)
+            low, high = _candidates(known, layer, at, stride)
+            if max(high - known[layer, at], known[layer, at] - low) > jump:
                 places[0, count], places[1, count], places[2, count] = y, x, at
                 sides[0, count], sides[1, count] = low, high
                 count += 1
@@ -155,16 +157,16 @@ def _sharpen(
 @inlined_part
 def _decide(given, count, work, sharp, moved):
     """Move the first `count` pixels of a batch to the other side where the evidence says so."""
-    everything, certain, guessed, colours, right, window, taps, table, weight, stride, places, sides = given
+    known, guessed, colours, others, size, window, taps, table, weight, stride, places, sides = given
     around, shades, middles, own, weights, votes, views, shares, inside, differences = work
     for i in range(np.uint64(count)):
         y, x, at = places[0, i], places[1, i], places[2, i]
-        flat = everything if guessed[y, x] else certain
+        layer = np.uint64(not guessed[y, x])
         middles[i], own[i] = F32(0.5) * (sides[0, i] + sides[1, i]), colours[at]
         for k in range(np.uint64(taps.size)):
             place = np.uint64(at + taps[k])
-            around[k, i], shades[k, i] = flat[place], colours[place]
-        inside[i] = _take_views(colours, at, right, window, y, x, sides, i, views, shares)
+            around[k, i], shades[k, i] = known[layer, place], colours[place]
+    _take_views(colours, others, size, window, places, sides, count, views, shares, inside)
     votes[:], differences[:] = 0, 0
     for k in range(taps.size):
         _add_votes(around[k], shades[k], middles, own, table, weights, votes, count)
@@ -172,11 +174,11 @@ def _decide(given, count, work, sharp, moved):
         _add_differences(views[k], shares[0], shares[1], np.int32(window[2, k]), differences, count)
     for i in range(count):
         y, x, at, middle = places[0, i], places[1, i], places[2, i], middles[i]
-        flat = everything if guessed[y, x] else certain
+        layer = np.uint64(not guessed[y, x])
         odds = ODDS + weight * F32(votes[i])
         odds += ODDS_PER_LEVEL * F32(differences[i] if inside[i] else np.int32(0))
-        if (odds > 0) != (flat[at] > middle):
-            sharp[y, x], moved[y, x] = _neighbours(flat, at, stride, middle, odds > 0), True
+        if (odds > 0) != (known[layer, at] > middle):
+            sharp[y, x], moved[y, x] = _neighbours(known, layer, at, stride, middle, odds > 0), True
 
 
 @kernel
@@ -206,12 +208,12 @@ def _listed(row, columns):
 
 
 @inlined_part
-def _candidates(flat, at, stride):
+def _candidates(known, layer, at, stride):
     """The smallest and largest disparity of a pixel and its neighbours."""
-    low = high = flat[at]
+    low = high = known[layer, at]
     for row in range(-1, 2):
         for column in range(-1, 2):
-            value = flat[np.uint64(at + row * stride + column)]
+            value = known[layer, np.uint64(at + row * stride + column)]
             low = value if value < low else low
             high = value if value > high else high
     return low, high
@@ -230,25 +232,26 @@ def _add_votes(disparities, colours, middles, own, table, weights, votes, count)
 
 
 @inlined_part
-def _take_views(colours, at, right, window, y, x, sides, i, views, shares):
-    """Copy what the window shows in the left image, and in the right one at both disparities of pixel i of a batch.
+def _take_views(colours, others, size, window, places, sides, count, views, shares, inside):
+    """Copy what the window shows in the left image, and in the right one at both disparities of each pixel of a batch.
 
-    Returns whether the window lies inside both images. window: for each of its pixels the offsets in `colours` and in
-    `right`, and the weight.
+    inside: whether the window lies inside both images. window: for each of its pixels the offsets in `colours` and in
+    `others`, and the weight.
     """
-    height, width = right.shape
-    others, far, near = right.reshape(-1), F32(x) - sides[0, i], F32(x) - sides[1, i]
-    one, two = np.int64(np.floor(far)), np.int64(np.floor(near))
-    inside = 1 <= y < height - 1 and REACH <= x < width - REACH and two >= REACH and one + REACH + 1 < width
-    if inside:
-        shares[0, i], shares[1, i] = (far - F32(one)) * F32(FRACTIONS), (near - F32(two)) * F32(FRACTIONS)
-        one, two = one + y * width, two + y * width
-        for k in range(np.uint64(window.shape[1])):
-            before, here = np.uint64(one + window[1, k]), np.uint64(two + window[1, k])
-            views[k, 0, i] = colours[np.uint64(at + window[0, k])]
-            views[k, 1, i], views[k, 2, i] = others[before], others[before + np.uint64(1)]
-            views[k, 3, i], views[k, 4, i] = others[here], others[here + np.uint64(1)]
-    return inside
+    height, width = size
+    for i in range(np.uint64(count)):
+        y, x, at = places[0, i], places[1, i], places[2, i]
+        far, near = F32(x) - sides[0, i], F32(x) - sides[1, i]
+        one, two = np.int64(np.floor(far)), np.int64(np.floor(near))
+        inside[i] = 1 <= y < height - 1 and REACH <= x < width - REACH and two >= REACH and one + REACH + 1 < width
+        if inside[i]:
+            shares[0, i], shares[1, i] = (far - F32(one)) * F32(FRACTIONS), (near - F32(two)) * F32(FRACTIONS)
+            one, two = one + y * width, two + y * width
+            for k in range(np.uint64(window.shape[1])):
+                before, here = np.uint64(one + window[1, k]), np.uint64(two + window[1, k])
+                views[k, 0, i] = colours[np.uint64(at + window[0, k])]
+                views[k, 1, i], views[k, 2, i] = others[before], others[before + np.uint64(1)]
+                views[k, 3, i], views[k, 4, i] = others[here], others[here + np.uint64(1)]
 
 
 @inlined_part
@@ -276,12 +279,12 @@ def _mix(before, after, rest, share):
 
 
 @inlined_part
-def _neighbours(flat, at, stride, middle, above):
+def _neighbours(known, layer, at, stride, middle, above):
     """Mean of the pixel's neighbours on one side of the middle disparity."""
     total, count = F32(0), F32(0)
     for row in range(-1, 2):
         for column in range(-1, 2):
-            value = flat[np.uint64(at + row * stride + column)]
+            value = known[layer, np.uint64(at + row * stride + column)]
             kept = value > middle if above else value <= middle
             total += value if kept else F32(0)
             count += F32(1) if kept else F32(0)
