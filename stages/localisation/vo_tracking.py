@@ -74,7 +74,7 @@ def vo_frame(frame: StereoFrame, disparity: Disparity) -> VoFrame:
     )
     if not found:
         return empty
-    pixels = (np.array([point.pt for point in found], np.float32) + 0.5) * shrink - 0.5
+    pixels = (np.asarray(cv2.KeyPoint.convert(found)) + 0.5) * shrink - 0.5
     return VoFrame(image, pixels, descriptors, _triangulated(pixels, disparity, frame.camera), frame.camera)
 
 
@@ -83,7 +83,7 @@ def _triangulated(pixels: Array, disparity: Disparity, camera: StereoCamera) -> 
     last = np.array(disparity.pixels.shape[::-1]) - 1
     corners = np.clip(pixels.astype(int) + np.array(list(np.ndindex(2, 2)))[:, None], 0, last)
     origins = disparity.source[corners[..., 1], corners[..., 0]]
-    seen = np.isin(origins, (PixelOrigin.MEASURED, PixelOrigin.PLANE)).all(axis=0)
+    seen = ((origins == PixelOrigin.MEASURED) | (origins == PixelOrigin.PLANE)).all(axis=0)
     places = pixels[:, 0].copy(), pixels[:, 1].copy()
     at = cv2.remap(disparity.pixels, *places, cv2.INTER_LINEAR, borderValue=float("nan")).ravel()
     shift = np.where(seen, at.astype(np.float64), np.nan) + (camera.cx_right - camera.cx)
