@@ -108,13 +108,13 @@ class Canvas:
         recurring: tuple[Component, ...] = (),
     ) -> None:
         """Log an entity. What recurs is left out while it is that of the last frame, which the viewer then takes."""
-        logged = self._recurred.get(path, ()) if path in self._before else ()
-        changed = (one for one in recurring if not any(one is other for other in logged))
+        logged = {*map(id, self._recurred.get(path, ()))} if path in self._before else ()
+        changed = (one for one in recurring if id(one) not in logged)
         self._recurred[path] = recurring
         self.rows.add(path, (*content, *changed))
         self._now[path] = kind
         if self.counts_bytes:
-            self.logged_bytes += sum(one.content.nbytes for one in (*content, *recurring))
+            self.logged_bytes += sum(one.nbytes for one in (*content, *recurring))
 
     def add_view(self, view: ViewSpec) -> None:
         """Add a view to the blueprint."""

@@ -286,9 +286,12 @@ def format_value(value: float) -> str:
 
 
 def _ranked(values: Array, *percents: float) -> list[float]:
-    """The values, (n,), at these percentiles; np.percentile takes longer for its checks than for the values."""
+    """The values, (n,), at these percentiles; np.percentile takes longer for its checks than for the values.
+
+    Sorted in vectors, which takes a quarter of the time of a partition where many values are equal.
+    """
     ranks = [round((values.size - 1) * (percent / 100)) for percent in percents]
-    return [float(value) for value in np.partition(values, ranks)[ranks]]
+    return [float(value) for value in np.sort(values)[ranks]]
 
 
 def _some_known(layer: Array) -> Array:
@@ -320,8 +323,11 @@ def _brightness(slope_x: Array, slope_y: Array, light: Array) -> Array:
     return _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * lit
 
 
-def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None = None) -> Array:
-    """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
+def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None = None, exact: bool = True) -> Array:
+    """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`).
+
+    exact: False for the colours that `fewer_shades` leaves of known cells.
+    """
     elevation = terrain.layers["elevation"]
     low, high = elevation_limits(elevation) if limits is None else limits
     known = np.flatnonzero(np.isfinite(elevation))
@@ -329,7 +335,8 @@ def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None =
     colors = apply_palette(elevation.ravel()[known], low, high, cv2.COLORMAP_VIRIDIS)
     flat = _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * _SUN[2]  # level ground keeps the palette's colour
     shade = _shade(elevation, known, terrain.resolution, _SUN) / flat
-    rgb[known] = np.clip(colors * shade[:, None], 0.0, 255.0).astype(np.uint8)
+    lit = np.clip(colors * shade[:, None], 0.0, 255.0).astype(np.uint8)
+    np.put(rgb.view("V3"), known, (lit if exact else fewer_shades(lit)).view("V3"))  # whole pixels, many times faster
     return rgb.reshape(*elevation.shape, 3)
 
 

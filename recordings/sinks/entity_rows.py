@@ -40,6 +40,11 @@ class Component(NamedTuple):
     descriptor: rr.ComponentDescriptor
     content: Any  # an array of Arrow, or a Blob
 
+    @property
+    def nbytes(self) -> int:
+        """The size of its content. Arrow takes ten times as long for the `nbytes` of an array."""
+        return int(self.content.nbytes if isinstance(self.content, Blob) else self.content.get_total_buffer_size())
+
 
 class _Column(NamedTuple):
     """A component of an entity in many rows, as rerun takes it."""
@@ -72,7 +77,7 @@ class EntityRows:
     def add(self, path: str, components: Sequence[Component]) -> None:
         """Add a row."""
         self._rows[path].append(_Row(self.stamp, self.frame, components))
-        self._bytes[path] += sum(one.content.nbytes for one in components)
+        self._bytes[path] += sum(one.nbytes for one in components)
         if self._bytes[path] >= BATCH_BYTES:
             self._send(path)
 
@@ -168,9 +173,10 @@ def _as_arrow(values: Any, form: pa.DataType) -> pa.Array:
         return pa.ListArray.from_arrays(_ends([len(line) for line in values]), places, type=form)
     if form == pa.uint32():
         colors = np.asarray(values, np.uint8)
-        rgba = np.full((len(colors), 4), 255, np.uint8)
-        rgba[:, : colors.shape[1]] = colors
-        return pa.array(rgba.view(">u4").ravel().astype(np.uint32))
+        abgr = np.full((len(colors), 4), 255, np.uint8)
+        for channel in range(colors.shape[1]):  # numpy is faster by columns
+            abgr[:, 3 - channel] = colors[:, channel]
+        return pa.array(abgr.view("<u4").ravel())
     if pa.types.is_floating(form):
         return pa.array(np.array(values, form.to_pandas_dtype(), ndmin=1))
     return pa.array(values if isinstance(values, list) else [getattr(values, "value", values)], form)
