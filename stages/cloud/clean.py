@@ -18,6 +18,7 @@ from stages.cloud.kernels.depth_order import out_of_order
 from stages.cloud.kernels.outliers import SupportRule, median_slope, supported, write_depths
 from stages.cloud.kernels.patches import connected_patches, in_patches
 from stages.data import Array, PointCloud
+from stages.data.arrays import rows_of
 from stages.stage import Stage, parameter
 
 MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
@@ -68,21 +69,19 @@ class Clean(Stage):
         return self.max_range + self.margin
 
     def _organised(self, cloud: PointCloud) -> Array:
-        """Indices of the points kept by their neighbours in the image; points not measured are only cropped."""
+        """Mask of the points kept by their neighbours in the image; points not measured are only cropped."""
         if cloud.shape is None:
             raise StageError("Clean: the cloud has no image shape; set it, or use method: knn")
         if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
             raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
         measured = cloud.measured
-        kept = self._supported(cloud, measured, cloud.shape)
-        others = np.flatnonzero(~measured)
-        if not len(others):
-            return kept
-        points = cloud.points.take(others, axis=0)
-        near = (points[:, 2] > 0) & (np.einsum("ij,ij->i", points, points) <= self._crop**2)
         chosen = np.zeros(len(measured), bool)
-        chosen[kept] = chosen[others[near]] = True
-        return np.flatnonzero(chosen)
+        chosen[self._supported(cloud, measured, cloud.shape)] = True
+        others = np.flatnonzero(~measured)
+        points = rows_of(cloud.points, others)
+        near = (points[:, 2] > 0) & (np.einsum("ij,ij->i", points, points) <= self._crop**2)
+        chosen[others[near]] = True
+        return chosen
 
     def _supported(self, cloud: PointCloud, measured: Array, shape: tuple[int, int]) -> Array:
         """Indices of the points kept of the measured ones.

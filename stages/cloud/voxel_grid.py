@@ -12,6 +12,7 @@ import numpy as np
 
 from stages.cloud.kernels.voxels import voxel_means
 from stages.data import LEVEL_FRAME, PointCloud, VoxelMap
+from stages.data.arrays import rows_of
 from stages.stage import Stage, check_cells, check_level, parameter
 
 
@@ -43,8 +44,7 @@ class VoxelGrid(Stage):
         check_level(self, cloud)
         x, y = cloud.points[:, 0], cloud.points[:, 1]
         inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.max_range**2)
-        near = np.flatnonzero(inside)
-        points, colors = cloud.points.take(near, axis=0), cloud.colors.take(near, axis=0)
+        points, colors = rows_of(cloud.points, inside), rows_of(cloud.colors, inside)
         index, count, colors = voxel_means(points, colors, self.resolution)
         kept = count >= self.min_points
         return VoxelMap(cloud.stamp, index[kept], colors[kept], count[kept], self.resolution, LEVEL_FRAME)

@@ -75,6 +75,17 @@ def read_only(array: Array) -> Array:
     return view
 
 
+def rows_of(array: Array, which: Array) -> Array:
+    """The rows of an array (n,) or (n, k) at a mask (n,) bool or at indices (m,).
+
+    Neighbouring rows of a mask are copied at once, as bytes, which is several times faster than row by row.
+    """
+    if array.ndim == 1:
+        return np.asarray(array[which])
+    raw = np.ascontiguousarray(array).view(np.dtype((np.void, array.itemsize * array.shape[1])))
+    return np.asarray(raw.reshape(-1)[which].view(array.dtype).reshape(-1, array.shape[1]))
+
+
 def check_rotation(rotation: Array, where: str) -> None:
     """Raise ValueError unless a (3, 3) matrix is orthonormal and right-handed."""
     if not np.all(np.abs(rotation @ rotation.T - _UNIT) <= _MAX_SKEW) or np.linalg.det(rotation) < 0:

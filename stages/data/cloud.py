@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from stages.data.arrays import Array, check_resolution, publish, publish_stamp
+from stages.data.arrays import Array, check_resolution, publish, publish_stamp, rows_of
 from stages.data.motion import Transform
 from stages.data.pixel_validity import PixelOrigin
 
@@ -72,10 +73,11 @@ class PointCloud:
 
     def only(self, kept: Array) -> PointCloud:
         """The points of a mask (N,) bool or of indices (n,) int, in that order."""
-        kept = np.flatnonzero(kept) if kept.dtype == bool else kept
-        source = None if self.source is None else self.source.take(kept)
-        fields = {name: getattr(self, name).take(kept, axis=0) for name in ("points", "colors", "sigma", "pixel")}
-        return replace(self, **fields, source=source)
+        fields: dict[str, Any] = {}
+        for name in ("points", "colors", "sigma", "pixel", "source"):
+            values = getattr(self, name)
+            fields[name] = None if values is None else rows_of(values, kept)
+        return replace(self, **fields)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,9 +29,10 @@ class Tiles:
     def read(self, row: int, col: int, rows: int, cols: int) -> Array:
         """A copy of the (rows, cols) cells from (row, col) on."""
         block = np.zeros((rows, cols), self.dtype)
+        raw = _raw(block)
         for index, inside, part in _parts(row, col, rows, cols):
             if index in self.tiles:
-                _raw(block)[part] = _raw(self.tiles[index])[inside]
+                raw[part] = _raw(self.tiles[index])[inside]
         return block
 
     def write(self, row: int, col: int, block: Array, changed: Array) -> None:
@@ -46,12 +47,12 @@ class Tiles:
 
 def taken(cells: Array, where: Array) -> Array:
     """A copy of the cells of a mask, (n,): `cells[where]`, many times faster where a cell has fields."""
-    return np.asarray(cells.reshape(-1).take(np.flatnonzero(where)))
+    return np.asarray(_raw(cells)[where].view(cells.dtype))
 
 
 def put(cells: Array, where: Array, values: Array) -> None:
     """Set the cells of a mask to values (n,): `cells[where] = values`, many times faster where a cell has fields."""
-    np.put(cells, np.flatnonzero(where), values)
+    _raw(cells)[where] = _raw(values)
 
 
 def copied(cells: Array) -> Array:

@@ -23,6 +23,7 @@ from stages.data import (
     Transform,
     VoxelMap,
 )
+from stages.data.arrays import rows_of
 from stages.matching.match import Match
 from stages.stage import Stage, parameter
 from tests.stages.terrain.terrain_scene import CAMERA, blank_frame
@@ -177,3 +178,15 @@ def test_a_parameter_that_is_not_finite_is_refused(value: float) -> None:
         Free(length=value)
     with pytest.raises(ValueError, match=r"Match\.p2 must be a finite number, not"):
         Match(p2=value)
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 3), (9,), (9, 3), (9, 1)])
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+def test_rows_are_those_that_numpy_indexes(shape: tuple[int, ...], dtype: type) -> None:
+    values = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
+    mask = np.arange(shape[0]) % 4 < 2
+    for which in (mask, ~mask, np.zeros_like(mask), np.flatnonzero(mask)[::-1]):
+        for array in (values, np.asfortranarray(values), values[::-1]):
+            found = rows_of(array, which)
+            assert found.dtype == dtype
+            np.testing.assert_array_equal(found, array[which])
