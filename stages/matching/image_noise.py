@@ -7,7 +7,6 @@ gray levels.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -22,7 +21,7 @@ FOURTH_DIFFERENCE = np.array([1, -4, 6, -4, 1], np.float32) / np.sqrt(70, dtype=
 BLOCK = 8  # px, side of the blocks whose mean square response is a sample of the variance
 SMOOTH_SHARE = 0.05  # of the blocks of one brightness count as smooth
 SMOOTH_VARIANCE = 0.45  # mean square response at that share of blocks of white noise, over its variance
-LEVELS, MIN_BIN = 256, 16  # gray levels
+LEVELS, BIN = 256, 16  # gray levels
 TEXTURED = 2.0  # a bin whose variance is this many times that of the line contains texture
 DARKEST, BRIGHTEST = 4, 244  # mean levels between which clipping does not reduce the noise
 MIN_BLOCKS = 60  # of a bin of brightness
@@ -61,14 +60,14 @@ def frame_noise(frame: StereoFrame) -> Array:
 def noise_levels(image: Array) -> Array:
     """Standard deviation of the noise at each gray level, (256,) float32, of an image (H, W) uint8."""
     variance, level = _samples(image)
-    edges = [0, *range(MIN_BIN, LEVELS, MIN_BIN), LEVELS]
-    groups = [(level >= low) & (level < high) for low, high in itertools.pairwise(edges)]
-    groups = [group for group in groups if group.sum() >= MIN_BLOCKS] or [np.ones(level.shape, bool)]
+    by_bin = np.argsort(level // BIN, kind="stable")
+    ends = np.cumsum(np.bincount(level // BIN, minlength=LEVELS // BIN))
+    groups = [group for group in np.split(by_bin, ends) if len(group) >= MIN_BLOCKS] or [by_bin]
     if not level.size:  # a black or white image
         return np.full(LEVELS, np.sqrt(MIN_VARIANCE), np.float32)
     levels = np.array([level[group].mean() for group in groups])
     smooth = np.array([_quantile(variance[group], SMOOTH_SHARE) for group in groups]) / SMOOTH_VARIANCE
-    offset, gain = _line(levels, np.maximum(smooth, MIN_VARIANCE), np.array([group.sum() for group in groups]))
+    offset, gain = _line(levels, np.maximum(smooth, MIN_VARIANCE), np.array([len(group) for group in groups]))
     return np.asarray(np.sqrt(MIN_VARIANCE + offset + gain * np.arange(LEVELS)), dtype=np.float32)
 
 
@@ -76,7 +75,7 @@ def _samples(image: Array) -> tuple[Array, Array]:
     """Mean square response and mean level of the blocks that are not clipped."""
     rows, cols = (extent // BLOCK for extent in image.shape)
     if not rows or not cols:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0, np.float32), np.zeros(0, np.uint8)
     whole = image[: rows * BLOCK, : cols * BLOCK]
     response = cv2.sepFilter2D(whole, cv2.CV_32F, FOURTH_DIFFERENCE, FOURTH_DIFFERENCE)
     variance = cv2.resize(response * response, (cols, rows), interpolation=cv2.INTER_AREA).ravel()
