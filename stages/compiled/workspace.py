@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ class Workspace:
     def __init__(self, pool: Workspaces | None = None) -> None:
         self.pool = pool
         self.whole = np.empty(0, np.uint8)
-        self.used = 0
+        self.used = self.address = 0
 
     def reserve(self, size: int) -> None:
         """Reserve `size` bytes; arrays of earlier calls become invalid."""
@@ -27,11 +28,11 @@ class Workspace:
         if self.whole.size < size:
             self.whole = np.empty(0, np.uint8)  # frees the old memory before the new is taken
             self.whole = np.empty(size, np.uint8)
-        self.used = 0
+        self.used, self.address = 0, self.whole.ctypes.data
 
     def bytes(self, size: int) -> Array:
         """Bytes with arbitrary content, on a 64-byte boundary of the workspace."""
-        start = self.used + -(self.whole.ctypes.data + self.used) % 64
+        start = self.used + -(self.address + self.used) % 64
         self.used = start + size
         if self.used > self.whole.size:
             raise MemoryError("the kernels' workspace is too small")
@@ -39,7 +40,7 @@ class Workspace:
 
     def array(self, shape: tuple[int, ...], kind: Any) -> Array:
         """An array with arbitrary content; it takes up to 63 extra bytes."""
-        size = int(np.prod(shape)) * np.dtype(kind).itemsize
+        size = math.prod(shape) * np.dtype(kind).itemsize
         items: Array = self.bytes(size).view(kind)
         return items.reshape(shape)
 
