@@ -150,8 +150,9 @@ class Refine(Stage):
         within = extent(smoothed, self.threads)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image, guide, right)
-        sharp = self._sharpened(self._bilateral(filled, guide), kinds != KEPT, *alike(image, other))
-        refined, sigma, consistent = self._supported(sharp, kinds != KEPT, frame)
+        guessed = kinds != KEPT
+        sharp = self._sharpened(self._bilateral(filled, guide), guessed, *alike(image, other))
+        refined, sigma, consistent = self._supported(sharp, guessed, frame)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
             self.threads,

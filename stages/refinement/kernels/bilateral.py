@@ -7,6 +7,8 @@ that its weight is negligible: 1e-30 of a neighbour's. Every other neighbour, as
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from stages.compiled.jit import fast_kernel, fast_part, kernel
@@ -35,6 +37,7 @@ def joint_bilateral(disparity: Array, guide: Array, radius: int, threads: int = 
     return filtered
 
 
+@cache
 def _spatial(radius: int, every: bool) -> Array:
     offsets = np.arange(-radius, radius + 1)
     counts = every | ((offsets[:, None] + offsets) % 2 == 0)

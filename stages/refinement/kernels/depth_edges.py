@@ -10,6 +10,8 @@ compiler makes vectors of the sums, as pixels are decided in batches and no numb
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -67,12 +69,14 @@ def sharpen_edges(
     return sharp
 
 
+@cache
 def _taps(radius: int) -> Array:
     """Offsets of every third pixel of a window from its middle: rows and columns, (n, 2)."""
     taps = np.indices((2 * radius + 1,) * 2).reshape(2, -1).T - radius
     return np.asarray(taps[(taps @ [1, 2]) % 3 == 0])
 
 
+@cache
 def _weights(colour: float) -> Array:
     """Weight by difference of colour, (256,) int32, `UNIT` for none."""
     return np.asarray(np.round(UNIT * np.exp(-np.arange(256) / colour)), np.int32)
