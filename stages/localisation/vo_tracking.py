@@ -150,7 +150,7 @@ def _predicted(
     points, pixels = points[depth > 0.1], pixels[depth > 0.1]
     if not len(points):
         return points, pixels, pixels
-    at = cv2.projectPoints(points, turn, shift, matrix, None)[0].reshape(-1, 2)
+    at, _ = projected(points, turn, shift.ravel(), matrix)
     height, width = later.gray.shape
     inside = np.all((at > PATCH / 2) & (at < np.array([width, height]) - PATCH / 2), axis=1)
     return points[inside], pixels[inside], at[inside].astype(np.float32)
