@@ -104,9 +104,10 @@ class Voxelise(Stage):
         if sensor is not None and cloud.shape is not None:
             ceiling = occlusion_ceiling(measured.points, measured.pixel, cloud.shape[1], sensor.translation, whole)
         grid = self._window(cloud, ceiling, whole)
-        figures = self._splatted(_statistics(measured, grid), measured, grid)
+        figures = _statistics(measured, grid)
         if sensor is not None:
-            staying = staying_points(measured.points, measured.sigma, sensor, grid)
+            staying = staying_points(measured.points, measured.sigma, sensor, grid, figures[:, :, 0])
+        figures = self._splatted(figures, measured, grid)
         layers = cell_layers(figures, staying, sensor, cloud.tilt_sigma, self._model, grid)
         empty = layers["count"] == 0
         if ceiling is not None:

@@ -70,11 +70,12 @@ def extent(points: Array, grid: Grid) -> Array:
 
 @kernel
 def _extent(points, raster, bounds):
+    top, left, bottom, right = bounds[0], bounds[1], bounds[2], bounds[3]
     for i in range(points.shape[0]):
         row, col = cell_of(np.float64(points[i, 0]), np.float64(points[i, 1]), raster)
         if row >= 0:
-            bounds[0], bounds[1] = min(bounds[0], row), min(bounds[1], col)
-            bounds[2], bounds[3] = max(bounds[2], row + 1), max(bounds[3], col + 1)
+            top, left, bottom, right = min(top, row), min(left, col), max(bottom, row + 1), max(right, col + 1)
+    bounds[0], bounds[1], bounds[2], bounds[3] = top, left, bottom, right
 
 
 def no_figures(grid: Grid) -> Array:

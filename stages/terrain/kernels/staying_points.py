@@ -14,38 +14,37 @@ from stages.data import Array, Transform
 from stages.terrain.kernels.grid import Grid, cell_of, cell_statistics_reference
 
 
-def staying_points(points: Array, sigma: Array, sensor: Transform, grid: Grid) -> Array:
+def staying_points(points: Array, sigma: Array, sensor: Transform, grid: Grid, count: Array) -> Array:
     """Least number of points in each cell, as they are and with all depths one sigma smaller or larger.
 
     points: (N, 3) float32, m; sigma: (N,) float32, depth standard deviation, m; sensor: the camera in the points'
-    frame. Returns (rows, cols) int32.
+    frame; count: (rows, cols) float64, points in each cell as they are. Returns (rows, cols) int32.
     """
-    counts, least = np.zeros((*grid.shape, 3), np.int32), np.empty(grid.shape, np.int32)
+    moved, least = np.zeros((*grid.shape, 2), np.int32), np.empty(grid.shape, np.int32)
     camera = sensor.translation, sensor.rotation[:, 2].copy()
-    _count(np.ascontiguousarray(points), np.ascontiguousarray(sigma), camera, grid.raster, counts, least)
+    _count(np.ascontiguousarray(points), np.ascontiguousarray(sigma), camera, grid.raster, count, moved, least)
     return least
 
 
 @kernel
-def _count(points, sigma, camera, raster, counts, least):
+def _count(points, sigma, camera, raster, count, moved, least):
     eye, axis = camera
     for i in range(points.shape[0]):
         x, y, z = points[i, 0] - eye[0], points[i, 1] - eye[1], points[i, 2] - eye[2]
         per_depth = sigma[i] / (x * axis[0] + y * axis[1] + z * axis[2])
-        for move in range(3):
-            stretch = (move - 1) * per_depth
+        for side in range(2):
+            stretch = (2 * side - 1) * per_depth
             row, col = cell_of(points[i, 0] + stretch * x, points[i, 1] + stretch * y, raster)
             if row >= 0:
-                counts[row, col, move] += 1
+                moved[row, col, side] += 1
     for row in range(least.shape[0]):
         for col in range(least.shape[1]):
-            least[row, col] = min(counts[row, col, 0], counts[row, col, 1], counts[row, col, 2])
+            least[row, col] = min(count[row, col], moved[row, col, 0], moved[row, col, 1])
 
 
-def staying_points_reference(points: Array, sigma: Array, sensor: Transform, grid: Grid) -> Array:
+def staying_points_reference(points: Array, sigma: Array, sensor: Transform, grid: Grid, count: Array) -> Array:
     """The same as `staying_points`, in plain numpy."""
     ray = points - sensor.translation
     step = (sigma / (ray @ sensor.rotation[:, 2]))[:, None] * ray
-    moved = [points + move * step for move in (-1, 0, 1)]
-    counts = [cell_statistics_reference(each, sigma, grid)[:, :, 0] for each in moved]
-    return np.asarray(np.min(counts, axis=0), np.int32)
+    moved = [cell_statistics_reference(points + move * step, sigma, grid)[:, :, 0] for move in (-1, 1)]
+    return np.asarray(np.min([count, *moved], axis=0), np.int32)

@@ -326,7 +326,8 @@ def test_staying_points_kernel_equals_the_reference() -> None:
     points = scattered(4).astype(np.float32)
     ahead = points[(points - SENSOR.translation) @ SENSOR.rotation[:, 2] > 1].repeat(4, axis=0)
     sigma = np.random.default_rng(5).uniform(0, 0.1, len(ahead)).astype(np.float32)
-    arguments = (ahead, sigma, SENSOR, GRID)
+    count = cell_statistics_reference(ahead, sigma, GRID)[:, :, 0]
+    arguments = (ahead, sigma, SENSOR, GRID, count)
     got, want = staying_points(*arguments), staying_points_reference(*arguments)
     assert 0 < want.sum() < len(ahead)
     np.testing.assert_array_equal(got, want)
