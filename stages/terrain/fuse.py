@@ -156,14 +156,15 @@ class _Fusion(Stage):
 
     def _observation(self, frame: FrameGrid) -> Observation:
         """The known cells of a frame; the errors of its position are added to their variance."""
-        known, layers = frame.known, frame.terrain.layers
+        known, layers = np.flatnonzero(frame.known), frame.terrain.layers
         elevation, minimum, maximum, variance, points = (
-            layers[name][known].astype(np.float64) for name in ("elevation", "minimum", "maximum", "variance", "count")
+            layers[name].reshape(-1).take(known).astype(np.float64)
+            for name in ("elevation", "minimum", "maximum", "variance", "count")
         )
-        east, north, _ = gradient_and_curvature(layers["elevation"].astype(np.float64)) / self.resolution
-        gradient = np.minimum(east**2 + north**2, MAX_GRADIENT**2)
-        variance += np.asarray(self.alignment_sigma**2 + self.position_sigma**2 * gradient)[known]
-        return Observation(*frame.offsets(known), elevation, minimum, maximum, variance, points)
+        slopes = gradient_and_curvature(layers["elevation"].astype(np.float64))[:2] / self.resolution
+        gradient = np.minimum(np.square(slopes.reshape(2, -1).take(known, axis=1)).sum(axis=0), MAX_GRADIENT**2)
+        variance += self.alignment_sigma**2 + self.position_sigma**2 * gradient
+        return Observation(*frame.offsets(frame.known), elevation, minimum, maximum, variance, points)
 
     def _aligned(
         self, frame: FrameGrid, observed: Observation, pose: Pose, up: Array, tilt_sigma: float, state: FusedMap

@@ -51,7 +51,7 @@ class FrameGrid:
 
     def offsets(self, which: Array) -> tuple[Array, Array]:
         """x and y, m from the rover, of the centres of the cells of a mask, (rows, cols) bool."""
-        rows, cols = np.nonzero(which)
+        rows, cols = np.divmod(np.flatnonzero(which), which.shape[1])
         firsts = ((self.col, cols), (self.row, rows))
         x, y = ((first + cells + 0.5) * self.terrain.resolution for first, cells in firsts)
         return x - self.level.translation[0], y - self.level.translation[1]
