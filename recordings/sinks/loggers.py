@@ -337,7 +337,7 @@ def log_camera(canvas: Canvas, stream: str, frame: StereoFrame, cloud: PointClou
     if sensor is None or not canvas.pictures:
         return
     left, scale = colormaps.top_eight_bits(frame.left, frame.right)[0], THUMBNAIL_SCALE
-    small = cv2.resize(left, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = colormaps.shrunk(left, int(np.ceil(scale * left.shape[1])))
     view = ViewSpec(Panel.CAMERA, stream, "camera", stream, cloud.frame_id)
     canvas.log_image(f"{view.path}/image", small, view)
     centre = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
