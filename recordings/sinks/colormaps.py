@@ -351,9 +351,10 @@ def surface(terrain: ElevationMap) -> tuple[Array, Array]:
     number[at] = np.arange(len(at), dtype=np.int32)
     corner = at[(row < rows - 1) & (col < cols - 1)]
     here, east, north, across = (number[corner + step] for step in (0, 1, cols, cols + 1))
-    halves = ((here, east, across), (here, across, north))
-    triangles = np.concatenate([np.stack(half, -1)[np.minimum(half[1], half[2]) >= 0] for half in halves])
-    return vertices, triangles.astype(np.uint32)
+    # In this order of the corners lz4 finds most repeats.
+    triangles = np.column_stack([east, across, here, north, here, across]).reshape(-1, 3)
+    known = (triangles[:, 0] | triangles[:, 1] | triangles[:, 2]) >= 0
+    return vertices, triangles[known].astype(np.uint32)
 
 
 def _slopes(elevation: Array, known: Array) -> tuple[Array, Array]:
