@@ -167,11 +167,11 @@ class TerrainFeatures(Stage):
 def _extrapolated(planes: Array, known: Array, where: Array, resolution: float) -> Array:
     """Least height of the nearest `known` plane extrapolated to the cells `where`, (n,), NaN far from it; planes: (3,
     rows, cols) of height, m, and rise per cell along columns and rows."""
-    rows, cols = np.nonzero(where)
+    rows, cols = np.divmod(np.flatnonzero(where), where.shape[1])
     row, col, distance = nearest_known(known, rows, cols, _cells(_MAX_EXTRAPOLATION, resolution))
     near = distance * resolution <= _MAX_EXTRAPOLATION
     extrapolated = np.full(len(rows), np.nan)
-    height, along, across = planes[:, row[near], col[near]]
+    height, along, across = planes.reshape(3, -1).take(row[near] * where.shape[1] + col[near], axis=1)
     extrapolated[near] = height + along * (cols - col)[near] + across * (rows - row)[near] - _EXTRAPOLATION_ERROR
     return extrapolated
 
