@@ -162,14 +162,14 @@ def grid_map(terrain: ElevationMap, step: float = 0.0, precision: float = 0.0) -
 
 def reason_map(navigation: NavigationMap) -> Any:
     """grid_map_msgs/GridMap with one layer, "reason": the reason for each cell of the OccupancyGrid."""
-    return _grid_map(navigation, {"reason": _turned(navigation.reason).astype(np.float32)}, [])
+    return _grid_map(navigation, {"reason": _turned(navigation.reason.astype(np.float32))}, [])
 
 
 def _turned(layer: Array) -> Array:
-    """layer[::-1, ::-1], copied; numpy takes three times as long."""
+    """A copy of layer[::-1, ::-1] with one form of NaN, as two compress badly; numpy takes three times as long."""
     import cv2  # which readers of logs do not wait for
 
-    return cv2.flip(layer, -1) if layer.size else layer
+    return cv2.patchNaNs(cv2.flip(layer, -1), np.nan) if layer.size else layer
 
 
 def _grid_map(grid: ElevationMap | NavigationMap, layers: Mapping[str, Array], basic: list[str]) -> Any:

@@ -175,6 +175,14 @@ def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x, outer, inner):
     assert (back.resolution, back.frame_id, back.stamp) == (cell, "odom", STAMP)
 
 
+def test_unknown_cells_of_a_grid_map_have_one_form():
+    layer = np.float32([[np.nan, -np.nan, 1], [0, -np.inf, -np.nan]])
+    message = grid_map(ElevationMap(STAMP, {"elevation": layer}, 0.5, (0.0, 0.0), "odom"))
+    found = message.data[0].data
+    np.testing.assert_array_equal(found, layer.ravel()[::-1])
+    assert {*found.view(np.uint32)[np.isnan(found)].tolist()} == {0x7FC00000}
+
+
 def test_a_grid_map_without_cells_is_read_back():
     message = grid_map(ElevationMap(STAMP, {"elevation": np.empty((0, 3), np.float32)}, 0.5, (0.0, 0.0), "odom"))
     assert read_grid_map(message).shape == (0, 3)
