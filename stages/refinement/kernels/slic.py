@@ -238,12 +238,12 @@ def _join_runs(labels, first, end, rows, ends, parent):
     width = labels.shape[1]
     run = first * width
     for y in range(first, end):
-        rows[y, 0] = run
-        for x in range(1, width + 1):
-            if x == width or labels[y, x] != labels[y, x - 1]:
-                ends[run] = x
-                parent[run] = run
-                run += 1
+        rows[y, 0], row = run, labels[y]
+        for x in range(1, width):  # without a branch
+            ends[run], parent[run] = x, run
+            run += np.int64(row[x] != row[x - 1])
+        ends[run], parent[run] = width, run
+        run += 1
         rows[y, 1] = run
         if y > first:
             _join(labels, y, rows, ends, parent)
