@@ -53,8 +53,9 @@ def sharpen_edges(
     height, width = disparity.shape
     layers = np.full((2, height + 2 * radius, width + 2 * radius), np.nan, np.float32)  # all disparities, matches
     padded, matches = layers
-    padded[radius : height + radius, radius : width + radius] = disparity
-    np.copyto(matches[radius : height + radius, radius : width + radius], disparity, where=~guessed)
+    inner = layers[:, radius : height + radius, radius : width + radius]
+    inner[:] = disparity
+    inner[1][guessed] = np.nan
     guide = packed(cv2.copyMakeBorder(left, radius, radius, radius, radius, cv2.BORDER_CONSTANT, value=0))
     taps = _taps(radius) @ [padded.shape[1], 1]
     window = np.stack([WINDOW @ [padded.shape[1], 1], WINDOW @ [width, 1], WINDOW_WEIGHTS])
