@@ -2,7 +2,8 @@
 
 Objects rest on the ground. An isolated patch that is nearer than the patch below it in the image would hang in the air,
 as mismatches in the sky do. A patch that is farther than the patch above it would lie under the ground. If two patches
-contradict the depth order, the smaller one is treated as the outlier.
+contradict the depth order, the smaller one is treated as the outlier. An overhanging rock is also nearer than the
+ground below it, but a larger patch recedes above it: this counts twice.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def out_of_order(inverse: Array, patch: Array, sizes: Array) -> Array:
 
 @kernel
 def _vote(inverse, patch, sizes, gone, min_ratio, votes):
-    """Add 1 for every column in which a patch is out of order with a larger one, else subtract 1."""
+    """Add 1 for every column in which a patch is out of order with a larger one, else subtract 1 or, below it, 2."""
     below = np.full(inverse.shape[1], -1, np.int32)  # in each column: the patch of the last point,
     last = np.empty(inverse.shape[1], np.float32)  # and its inverse depth
     for row in range(inverse.shape[0] - 1, -1, -1):
@@ -45,8 +46,11 @@ def _vote(inverse, patch, sizes, gone, min_ratio, votes):
             if here < 0 or gone[here]:
                 continue
             if other >= 0 and other != here:
-                smaller = here if sizes[here] < sizes[other] else other
-                votes[smaller] += 1 if inverse[row, col] > min_ratio * last[col] else -1
+                nearer = inverse[row, col] > min_ratio * last[col]
+                if sizes[here] < sizes[other]:
+                    votes[here] += 1 if nearer else -1
+                else:
+                    votes[other] += 1 if nearer else -2
             below[col], last[col] = here, inverse[row, col]
 
 
@@ -61,6 +65,7 @@ def out_of_order_reference(inverse: Array, patch: Array, sizes: Array) -> Array:
                 one, other = numbers[above], numbers[under]
                 if one != other:
                     nearer = column[above] > np.float32(MIN_DEPTH_RATIO) * column[under]
-                    votes[one if sizes[one] < sizes[other] else other] += 1 if nearer else -1
+                    smaller, in_order = (one, -1) if sizes[one] < sizes[other] else (other, -2)
+                    votes[smaller] += 1 if nearer else in_order
         gone |= votes > 0
     return gone

@@ -179,6 +179,15 @@ def test_a_large_patch_in_the_sky_or_under_the_ground_is_dropped(
     assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
 
 
+def test_a_rock_that_hangs_before_the_ground_stays() -> None:
+    d = seen_disparity(())
+    d[250:290, 250:400] = 1.3 * d[290].max()
+    d[:250, 250:270] = np.nan  # above some of it nothing is known
+    pixels = Clean()(Reproject()(blank_frame(), as_disparity(d))).pixel
+    rows, columns = np.divmod(pixels, CAMERA.width)
+    assert ((rows >= 250) & (rows < 290) & (columns >= 250) & (columns < 400)).sum() > 0.95 * 40 * 150
+
+
 def test_support_kernel_equals_the_reference() -> None:
     cloud, _ = with_floaters(cloud_with_noise(5), 0.05)
     random = np.random.default_rng(6)
