@@ -273,6 +273,20 @@ def print_worth(cases: list[Case]) -> None:
         print(f"{name:32} {100 * share:7.1f} {stated:7.2f} {true:18.2f}")
 
 
+def print_sigmas(cases: list[Case]) -> None:
+    """Print the shares of the measured disparities of what both cameras see within one and two stated sigmas."""
+    for pipeline in ("rover", "fast", "accurate"):
+        shares = []
+        for case in cases:
+            found = stereo_part(pipeline, case.frame, case.disparities, entry="rectified")["disparity"]
+            assert found.sigma is not None
+            scored = (found.source == PixelOrigin.MEASURED) & np.isfinite(case.truth) & (case.mask == 255)
+            off = np.abs(found.pixels - case.truth)[scored] / found.sigma[scored]
+            shares.append([100 * np.mean(off <= sigmas) for sigmas in (1, 2)])
+        one, two = np.mean(shares, axis=0)
+        print(f"measured by {pipeline}: {one:.0f} % within one stated sigma, {two:.0f} % within two")
+
+
 def print_table(title: str, means: dict[str, Array], released: Array | None) -> None:
     """Print the errors in percent (RMS in px); with `released` also their ratios to the released code's."""
     print(f"\n{title:34} {COLUMNS}  known %  bad-1 at edges  elsewhere")
@@ -336,6 +350,7 @@ def main(folder: Path) -> None:
         print_table("Middlebury scenes", measure(cases), released)
         print_fills(cases)
         print_worth(cases)
+        print_sigmas(cases)
         for name, frame in devon(data):
             ways = {
                 "without support": stereo_part("accurate", frame, 192, changes={"support": False})["disparity"],
@@ -348,6 +363,7 @@ def main(folder: Path) -> None:
     print_fills(cases)
     print_skies(cases)
     print_worth(cases)
+    print_sigmas(cases)
     for case in cases:
         streams = stereo_part("accurate", case.frame, case.disparities, entry="rectified")
         pictures(folder, case.name.replace(" ", "-"), case.frame, streams["disparity"])
