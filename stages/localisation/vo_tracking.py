@@ -14,7 +14,6 @@ import numpy as np
 
 from stages.compiled.hamming import clear_partners
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
-from stages.localisation.kernels.projection import projected
 from stages.matching.intensity import eight_bit, gray
 from stages.robust_weights import tukey_weights
 
@@ -150,7 +149,7 @@ def _predicted(
     points, pixels = points[depth > 0.1], pixels[depth > 0.1]
     if not len(points):
         return points, pixels, pixels
-    at, _ = projected(points, turn, shift.ravel(), matrix)
+    at = cv2.projectPoints(points, turn, shift, matrix, None)[0].reshape(-1, 2)
     height, width = later.gray.shape
     inside = np.all((at > PATCH / 2) & (at < np.array([width, height]) - PATCH / 2), axis=1)
     return points[inside], pixels[inside], at[inside].astype(np.float32)
@@ -162,8 +161,9 @@ def _fitted(
     """The pose that fits points (N, 3) to their pixels (N, 2), by Gauss-Newton with Tukey's weights."""
     pose = np.concatenate([turn.ravel(), shift.ravel()])
     for _ in range(FIT_ROUNDS):
-        at, jacobian = projected(points, pose[:3], pose[3:], matrix)
-        errors = (found - at).ravel()
+        at, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], matrix, None)
+        errors = (found - at.reshape(-1, 2)).ravel()
+        jacobian = jacobian[:, :6]
         sizes = np.linalg.norm(errors.reshape(-1, 2), axis=1)
         scale = max(float(np.median(sizes)) / 1.1774, MIN_PATCH_SIGMA)  # median of a Rayleigh distribution
         weights = tukey_weights(sizes, scale)

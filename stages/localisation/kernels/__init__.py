@@ -1,1 +1,0 @@
-"""Compiled loops of localisation, one algorithm a file, each beside its plain reference."""
