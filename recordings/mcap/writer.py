@@ -7,7 +7,6 @@ images. The log gets its name when it is complete.
 from __future__ import annotations
 
 import hashlib
-import struct
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -16,18 +15,16 @@ from typing import Any, BinaryIO, NamedTuple, Self
 
 import mcap.writer
 from isal import isal_zlib
-from mcap.data_stream import RecordBuilder
 from mcap.writer import CompressionType, Writer
 
 from flow.contracts import counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
-from recordings.ros2.cdr import LAST_STAMP, serialized, standard_types
+from recordings.ros2.cdr import LAST_STAMP, standard_types
 
 mcap.writer.zlib = isal_zlib  # type: ignore[attr-defined]  # the same checksums in a tenth of the time
 MIN_OWN_CHUNK_BYTES = 64 * 1024  # of a message that gets a chunk of its own
-RECORD_START = 31  # bytes of a message's record before its data: opcode, length, channel, sequence, two times
 COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
 
 
@@ -55,34 +52,6 @@ class MessageKind(NamedTuple):
     text: bytes
 
 
-_Builder: Any = RecordBuilder  # whose published type is incomplete
-
-
-class _Records(_Builder):  # type: ignore[misc]
-    """The records of a chunk. A single large one stays where its data are, if these follow room for its start."""
-
-    _whole: bytearray | None = None  # the chunk of such a record
-
-    def write(self, data: bytes | memoryview) -> None:
-        buffer = data.obj if isinstance(data, memoryview) and len(data) >= MIN_OWN_CHUNK_BYTES else None
-        if isinstance(buffer, bytearray) and self.count == RECORD_START == len(buffer) - len(data):
-            buffer[:RECORD_START] = super().end()
-            self._whole = buffer
-        else:
-            super().write(data)
-
-    def finish_record(self) -> None:
-        if self._whole is None:
-            super().finish_record()
-        else:
-            struct.pack_into("<Q", self._whole, 1, len(self._whole) - 9)  # all that follows the length
-
-    def end(self) -> bytes | bytearray:
-        whole, self._whole = self._whole, None
-        rest: bytes = super().end()
-        return rest if whole is None else whole
-
-
 class Ros2Writer:
     """Writes messages as `ros2msg` / CDR, with log time = publish time = stamp. Same calls, same bytes.
 
@@ -105,8 +74,6 @@ class Ros2Writer:
         with writing(self.path):
             self._file = self._open()
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
-        if builder := getattr(self._writer, "_Writer__chunk_builder", None):  # of mcap's versions so far
-            builder.record_writer = _Records()
         self._writer.start(profile=self.profile, library="roverflow")
 
     @property
@@ -122,7 +89,7 @@ class Ros2Writer:
         if kind not in self._kinds:
             text, _ = standard_types().generate_msgdef(kind, ros_version=2)
             self._kinds[kind] = MessageKind(kind, "cdr", "ros2msg", text.encode())
-        self.add(topic, self._kinds[kind], stamp, serialized(message, RECORD_START))
+        self.add(topic, self._kinds[kind], stamp, standard_types().serialize_cdr(message, kind))
 
     def add(
         self, topic: str, kind: MessageKind, stamp: int, data: bytes | memoryview, copy_of: int | None = None

@@ -72,16 +72,6 @@ def make(name: str, /, **fields: Any) -> Any:
     return cls(**fields)
 
 
-def serialized(message: Any, room: int = 0) -> memoryview:
-    """The CDR of a message, little-endian. room: bytes that its buffer has before it."""
-    types = standard_types()
-    codec = types.get_msgdef(message.__msgtype__)
-    data = memoryview(bytearray(room + 4 + codec.getsize_cdr(0, message, types)))[room:]
-    data[1] = 1
-    codec.serialize_cdr_le(data[4:], 0, message, types)
-    return data
-
-
 def full_name(schema_name: str) -> str:
     """The full name: "sensor_msgs/msg/Image" for "sensor_msgs/Image"."""
     package, _, rest = schema_name.partition("/")

@@ -45,7 +45,7 @@ from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
-PLOT_BATCH, LIVE_BATCH = 128, 4  # frames whose numbers and lines are sent at once, without and with a viewer
+PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers and lines are sent at once, without and with a viewer
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn

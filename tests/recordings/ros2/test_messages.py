@@ -239,23 +239,6 @@ def test_a_log_gets_its_name_when_it_is_complete(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
-def test_large_messages_are_alone_in_their_chunks(tmp_path, compression):
-    sizes = (10, 300_000, 20, 70_000, 2_000_000, 30, 40)
-    rng = np.random.default_rng(1)
-    sent = [image(STAMP, "camera", rng.integers(0, 255, (1, size), np.uint8)) for size in sizes]
-    with Ros2Writer(tmp_path / "log.mcap", compression=compression) as writer:
-        for number, message in enumerate(sent):
-            writer.write("/image", message, STAMP + number)
-    with (tmp_path / "log.mcap").open("rb") as file:
-        reader = make_reader(file, validate_crcs=True)
-        found = [(message.sequence, message.log_time, bytes(message.data)) for *_, message in reader.iter_messages()]
-        chunks = reader.get_summary().chunk_indexes
-    encoded = [bytes(standard_types().serialize_cdr(message, message.__msgtype__)) for message in sent]
-    assert found == [(number + 1, STAMP + number, data) for number, data in enumerate(encoded)]
-    assert [chunk.message_end_time - STAMP for chunk in chunks] == [0, 1, 2, 3, 4, 6]
-
-
 def test_an_unwritable_path_is_named(tmp_path):
     with pytest.raises(LogError, match=r"cannot write .*nowhere/out\.mcap: No such file"):
         Ros2Writer(tmp_path / "nowhere" / "out.mcap")
