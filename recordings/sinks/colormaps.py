@@ -53,15 +53,15 @@ REASON_LEGEND: Legend = {
     CellReason.UNMATCHED: ("unmatched", (110, 120, 170)),
 }
 
-SUN = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map
-AMBIENT_LIGHT = 0.35
+_SUN = np.array([1.0, 1.0, np.sqrt(2.0)]) / 2.0  # from ahead on the left, 45 degrees high: the upper left of the map
+_AMBIENT_LIGHT = 0.35
 
 
 def apply_palette(values: Array, low: float, high: float, palette: int) -> Array:
     """values, any shape (..., ), as RGB uint8 (..., 3) of an OpenCV palette over [low, high]; NaN is UNKNOWN_RGB."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
     color = np.where(np.isfinite(values), share * 255.0 + 0.5, 256.0).astype(np.uint16)
-    return palette_table(palette).take(color, axis=0)
+    return _table(palette).take(color, axis=0)
 
 
 def legend_colors(codes: Array, legend: Legend) -> Array:
@@ -300,7 +300,7 @@ def _some_known(layer: Array) -> Array:
     return known[:: max(1, known.size // MIN_SAMPLES)]
 
 
-def hillshade(elevation: Array, resolution: float, light: Array = SUN) -> Array:
+def hillshade(elevation: Array, resolution: float, light: Array = _SUN) -> Array:
     """Brightness of sunlit ground, (rows, cols) float in [0, 1]; slopes next to unknown cells are one-sided.
 
     light: unit vector (3,) towards the sun, along x, y and up.
@@ -320,20 +320,23 @@ def _shade(elevation: Array, known: Array, resolution: float, light: Array) -> A
 def _brightness(slope_x: Array, slope_y: Array, light: Array) -> Array:
     normal = np.sqrt(slope_x**2 + slope_y**2 + 1.0)
     lit: Array = np.clip((light[2] - light[0] * slope_x - light[1] * slope_y) / normal, 0.0, 1.0)
-    return AMBIENT_LIGHT + (1.0 - AMBIENT_LIGHT) * lit
+    return _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * lit
 
 
-def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None = None) -> Array:
-    """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`)."""
+def elevation_colors(terrain: ElevationMap, limits: tuple[float, float] | None = None, exact: bool = True) -> Array:
+    """Shaded relief of the layer "elevation" as RGB (rows, cols, 3), in grid order (see `birds_eye`).
+
+    exact: False for the colours that `fewer_shades` leaves of known cells.
+    """
     elevation = terrain.layers["elevation"]
     low, high = elevation_limits(elevation) if limits is None else limits
     known = np.flatnonzero(np.isfinite(elevation))
     rgb = np.frombuffer(bytearray(bytes(UNKNOWN_RGB) * elevation.size), np.uint8).reshape(-1, 3)
     colors = apply_palette(elevation.ravel()[known], low, high, cv2.COLORMAP_VIRIDIS)
-    flat = AMBIENT_LIGHT + (1.0 - AMBIENT_LIGHT) * SUN[2]  # level ground keeps the palette's colour
-    shade = _shade(elevation, known, terrain.resolution, SUN) / flat
+    flat = _AMBIENT_LIGHT + (1.0 - _AMBIENT_LIGHT) * _SUN[2]  # level ground keeps the palette's colour
+    shade = _shade(elevation, known, terrain.resolution, _SUN) / flat
     lit = np.clip(colors * shade[:, None], 0.0, 255.0).astype(np.uint8)
-    np.put(rgb.view("V3"), known, lit.view("V3"))  # whole pixels, many times faster
+    np.put(rgb.view("V3"), known, (lit if exact else fewer_shades(lit)).view("V3"))  # whole pixels, many times faster
     return rgb.reshape(*elevation.shape, 3)
 
 
@@ -381,7 +384,7 @@ def _mean_rise(heights: Array) -> Array:
 
 
 @cache
-def palette_table(palette: int) -> Array:
+def _table(palette: int) -> Array:
     """The 256 RGB colours of an OpenCV palette and UNKNOWN_RGB, (257, 3) uint8."""
     steps = np.arange(256, dtype=np.uint8)[:, None]
     table: Array = np.vstack([cv2.applyColorMap(steps, palette)[:, 0, ::-1], np.array(UNKNOWN_RGB, np.uint8)])

@@ -10,7 +10,6 @@ import rerun as rr
 
 from flow.contracts import counted
 from recordings.png import png
-from recordings.relief import relief
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
@@ -265,11 +264,11 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     terrain = colormaps.terrain_ahead(terrain)
     elevation, suffix = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
     low, high = canvas.limits(stream, *colormaps.elevation_limits(elevation))
-    rgb, known = relief(terrain, (low, high)), np.isfinite(elevation)
-    view = ViewSpec(Panel.RELIEF, stream, "relief", f"relief{suffix}")
-    canvas.log_exact(view.path, colormaps.birds_eye(rgb), view)
-    canvas.log_scale(f"{view.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
-    canvas.log_distances(f"{view.path}/lines", terrain.shape, terrain)
+    rgb, known = colormaps.elevation_colors(terrain, (low, high), exact=False), np.isfinite(elevation)
+    relief = ViewSpec(Panel.RELIEF, stream, "relief", f"relief{suffix}")
+    canvas.log_exact(relief.path, colormaps.birds_eye(rgb), relief)
+    canvas.log_scale(f"{relief.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
+    canvas.log_distances(f"{relief.path}/lines", terrain.shape, terrain)
     caption = f"{stream} {counted(int(np.count_nonzero(known)), 'cell')}"
     if not canvas.pictures:
         return caption

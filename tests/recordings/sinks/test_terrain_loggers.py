@@ -5,7 +5,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from recordings.sinks.colormaps import REASON_LEGEND, SOURCE_LEGEND, apply_palette
+from recordings.sinks.colormaps import (
+    REASON_LEGEND,
+    SOURCE_LEGEND,
+    UNKNOWN_RGB,
+    apply_palette,
+    elevation_colors,
+    fewer_shades,
+)  # fmt: skip
 from stages.data import LEVEL_FRAME, CellReason, ElevationMap, PixelOrigin, VoxelMap
 from tests.recordings.sinks.recorded_scene import START, Record, entities, record_of, rows, scene
 
@@ -20,6 +27,16 @@ def test_a_map_that_a_later_map_contains_is_not_drawn_twice(tmp_path):
     drawn = entities(record_of(tmp_path / "a.rrd", [Record(START, maps)], streams=streams))
     assert {"/other/relief", "/elevation_map/relief", "/elevation_map/layers/slope"} <= drawn
     assert not any(entity.startswith("/cells") for entity in drawn)
+
+
+def test_fewer_shades_of_a_relief_leave_unknown_cells_their_colour():
+    heights = np.random.default_rng(1).normal(size=(9, 7)).astype(np.float32)
+    heights[2:5, 3] = np.nan
+    terrain = ElevationMap(START, {"elevation": heights}, 0.05, (0.0, 0.0), LEVEL_FRAME)
+    exact, fewer, known = elevation_colors(terrain), elevation_colors(terrain, exact=False), np.isfinite(heights)
+    np.testing.assert_array_equal(fewer[known], fewer_shades(exact[known]))
+    assert (fewer[~known] == UNKNOWN_RGB).all()
+    assert len(np.unique(exact[known], axis=0)) > len(np.unique(fewer[known], axis=0)) > 1
 
 
 def test_layers_with_a_limit_and_heights_have_scales_that_stay(tmp_path):
