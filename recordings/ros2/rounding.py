@@ -35,9 +35,10 @@ def to_multiples(values: Array, step: float) -> Array:
 
 
 def to_relative(values: Array, precision: float) -> Array:
-    """float32 values whose last bits are 0, within a relative error of `precision`; 0: as they are.
+    """float32 values whose last bits are 0, within a relative error of `precision`, below 0.5; 0: as they are.
 
     Adding half of the last kept bit rounds the magnitude, because floats of one sign are in the order of their bits.
+    NaN keeps its first bit, so it stays NaN.
     """
     spare = MANTISSA_BITS if not precision else MANTISSA_BITS + 1 + math.floor(math.log2(precision))
     if not precision or spare < 1:
