@@ -39,6 +39,7 @@ def joint_bilateral(disparity: Array, guide: Array, radius: int, threads: int = 
 
 @cache
 def _spatial(radius: int, every: bool) -> Array:
+    """Weight by distance, (2 radius + 1, 2 radius + 1) float32, 0 for the neighbours that do not count."""
     offsets = np.arange(-radius, radius + 1)
     counts = every | ((offsets[:, None] + offsets) % 2 == 0)
     return np.where(counts, np.exp(-(offsets[:, None] ** 2 + offsets**2) / (2 * radius**2)), 0).astype(np.float32)
@@ -82,7 +83,7 @@ def _filter(values, levels, spatial, first, end, filtered):
 
 @fast_part
 def _add(centres, values, levels, near_levels, start, near, count, tap, sums, weights):
-    """Add one neighbour of `count` pixels of a row: those from `near` on to those from `start` on."""
+    """Add one neighbour to each of `count` pixels: the first pixel is in column `start`, its neighbour in `near`."""
     for i in range(count):
         here, there = start + i, near + i
         e, g = values[there] - centres[here], near_levels[there] - levels[here]

@@ -126,12 +126,12 @@ def _mark_jumps(above, row, below, jump, found):
 def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius, jump, asked, sharp, moved, first, end):
     """Sharpen the pixels of rows first to end that are asked; layers and guide have a border.
 
-    layers: disparities for guesses, and those of matches for matches. The pixels are decided in batches, in which they
-    lie side by side in the work arrays. An array that depends on the pixel would be counted for each, which takes as
-    long as all the rest.
+    layers: all disparities, which count for guesses, and those of matches, which count for matches. One array contains
+    both, because numba counts references to an array that is chosen for each pixel, which takes as long as all the
+    rest. The pixels are decided in batches, in which they lie side by side in the work arrays.
     """
     stride, columns, count = layers.shape[2], np.empty(sharp.shape[1] + 1, np.int64), 0
-    known, size = layers.reshape(2, -1), right.shape
+    disparities, size = layers.reshape(2, -1), right.shape
     places, sides = np.empty((3, BATCH), np.int64), np.empty((2, BATCH), np.float32)
     # Side by side: disparities and colours of the taps, the middle disparity, the own colour, weights and votes; the
     # colours that the images have in the window, the fractions, whether it lies inside, and how much they differ
@@ -142,14 +142,15 @@ def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius,
         np.empty(BATCH, np.int32),
     )  # fmt: skip
     given = (
-        known, guessed, guide.reshape(-1), right.reshape(-1), size, window, taps, table, weight, stride, places, sides
+        disparities, guessed, guide.reshape(-1), right.reshape(-1), size, window, taps, table, weight, stride, places,
+        sides,
     )  # fmt: skip
     for y in range(first, end):
         for n in range(_listed(asked[y], columns)):
             x = columns[n]
             layer, at = np.uint64(not guessed[y, x]), np.int64((y + radius) * stride + x + radius)
-            low, high = _candidates(known, layer, at, stride)
-            if max(high - known[layer, at], known[layer, at] - low) > jump:
+            low, high = _candidates(disparities, layer, at, stride)
+            if max(high - disparities[layer, at], disparities[layer, at] - low) > jump:
                 places[0, count], places[1, count], places[2, count] = y, x, at
                 sides[0, count], sides[1, count] = low, high
                 count += 1
@@ -162,7 +163,7 @@ def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius,
 @inlined_part
 def _decide(given, count, work, sharp, moved):
     """Move the first `count` pixels of a batch to the other side where the evidence says so."""
-    known, guessed, colours, others, size, window, taps, table, weight, stride, places, sides = given
+    disparities, guessed, colours, others, size, window, taps, table, weight, stride, places, sides = given
     around, shades, middles, own, weights, votes, views, shares, inside, differences = work
     for i in range(np.uint64(count)):
         y, x, at = places[0, i], places[1, i], places[2, i]
@@ -170,7 +171,7 @@ def _decide(given, count, work, sharp, moved):
         middles[i], own[i] = F32(0.5) * (sides[0, i] + sides[1, i]), colours[at]
         for k in range(np.uint64(taps.size)):
             place = np.uint64(at + taps[k])
-            around[k, i], shades[k, i] = known[layer, place], colours[place]
+            around[k, i], shades[k, i] = disparities[layer, place], colours[place]
     _take_views(colours, others, size, window, places, sides, count, views, shares, inside)
     votes[:], differences[:] = 0, 0
     for k in range(taps.size):
@@ -182,8 +183,8 @@ def _decide(given, count, work, sharp, moved):
         layer = np.uint64(not guessed[y, x])
         odds = ODDS + weight * F32(votes[i])
         odds += ODDS_PER_LEVEL * F32(differences[i] if inside[i] else np.int32(0))
-        if (odds > 0) != (known[layer, at] > middle):
-            sharp[y, x], moved[y, x] = _neighbours(known, layer, at, stride, middle, odds > 0), True
+        if (odds > 0) != (disparities[layer, at] > middle):
+            sharp[y, x], moved[y, x] = _neighbours(disparities, layer, at, stride, middle, odds > 0), True
 
 
 @kernel
@@ -213,12 +214,12 @@ def _listed(row, columns):
 
 
 @inlined_part
-def _candidates(known, layer, at, stride):
+def _candidates(disparities, layer, at, stride):
     """The smallest and largest disparity of a pixel and its neighbours."""
-    low = high = known[layer, at]
+    low = high = disparities[layer, at]
     for row in range(-1, 2):
         for column in range(-1, 2):
-            value = known[layer, np.uint64(at + row * stride + column)]
+            value = disparities[layer, np.uint64(at + row * stride + column)]
             low = value if value < low else low
             high = value if value > high else high
     return low, high
@@ -284,12 +285,12 @@ def _mix(before, after, rest, share):
 
 
 @inlined_part
-def _neighbours(known, layer, at, stride, middle, above):
+def _neighbours(disparities, layer, at, stride, middle, above):
     """Mean of the pixel's neighbours on one side of the middle disparity."""
     total, count = F32(0), F32(0)
     for row in range(-1, 2):
         for column in range(-1, 2):
-            value = known[layer, np.uint64(at + row * stride + column)]
+            value = disparities[layer, np.uint64(at + row * stride + column)]
             kept = value > middle if above else value <= middle
             total += value if kept else F32(0)
             count += F32(1) if kept else F32(0)

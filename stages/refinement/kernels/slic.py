@@ -239,7 +239,7 @@ def _join_runs(labels, first, end, rows, ends, parent):
     run = first * width
     for y in range(first, end):
         rows[y, 0], row = run, labels[y]
-        for x in range(1, width):  # without a branch
+        for x in range(1, width):  # without a branch, which nothing predicts
             ends[run], parent[run] = x, run
             run += np.int64(row[x] != row[x - 1])
         ends[run], parent[run] = width, run
