@@ -289,3 +289,18 @@ def test_a_pair_is_drawn_alike_with_a_moved_right_image():
     assert same_view(camera, replace(camera, cx_right=260.0))
     assert not same_view(camera, replace(camera, width=320, height=240, cx=160.0, cx_right=160.0))
     assert not same_view(camera, replace(camera, cx=300.0))
+
+
+@pytest.mark.parametrize("width", [WIDTH, WIDTH - 3])
+def test_the_image_in_the_frustum_is_a_quarter_as_wide_and_fits_its_lens(width, tmp_path):
+    items, left = scene(), np.full((HEIGHT, width), 40, np.uint8)
+    left[20:24, 32:36] = 240  # one pixel of the picture
+    camera = replace(items["rectified"].camera, width=width)
+    items["rectified"] = StereoFrame(START, left, left, camera)
+    path = record_of(tmp_path / "a.rrd", [Record(START, {name: items[name] for name in ("rectified", "points")})])
+    picture = decoded(rows(path, "/rectified/camera/image", "EncodedImage:blob")[0][2][0], cv2.IMREAD_UNCHANGED)
+    lens = np.reshape(rows(path, "/rectified/camera", "Pinhole:image_from_camera")[0][2][0], (3, 3)).T
+    assert picture.shape == (HEIGHT // 4, width // 4)
+    assert rows(path, "/rectified/camera", "Pinhole:resolution")[0][2][0] == [width // 4, HEIGHT // 4]
+    np.testing.assert_allclose(lens, [[20, 0, 7.5], [0, 20, 5.5], [0, 0, 1]])  # a pixel's place refers to its centre
+    assert np.unravel_index(picture.argmax(), picture.shape) == (5, 8)
