@@ -18,7 +18,7 @@ RIGHT = "/stereo/right/image_rect_color"
 
 
 def test_stages_before_the_change_run_once(traverse, tmp_path, said, monkeypatch):
-    runs = dict.fromkeys(("Match", "Voxelise", "Binarise"), 0)
+    runs = dict.fromkeys(("Match", "Voxelise", "FuseRegion", "Binarise"), 0)
 
     def counting(name):
         stage = getattr(stages, name)
@@ -44,7 +44,7 @@ def test_stages_before_the_change_run_once(traverse, tmp_path, said, monkeypatch
     assert re.search(r"/nav/navigation_map: 2 of 2 messages differ; up to .* cells from free to hazard", output)
     assert "equal: /nav/disparity, " in output
     # A frame has three matches, cells for its own and the regional map, and maps of its own, changed, and regional.
-    assert runs == {"Match": 6, "Voxelise": 4, "Binarise": 6}
+    assert runs == {"Match": 6, "Voxelise": 2, "FuseRegion": 2, "Binarise": 6}
     assert out.stat().st_size > 10_000
 
 

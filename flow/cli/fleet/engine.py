@@ -15,6 +15,7 @@ from flow.cli.fleet.catalogue import WAITING, Catalogue
 from flow.cli.fleet.progress import Progress, frames_so_far
 from flow.cli.fleet.task import Task, about_worker, run_task, unfit
 from flow.errors import INCOMPLETE, RoverflowError, UsageError
+from flow.runtime.interrupts import Stop, interrupts
 
 POLL_SECONDS = 1.0
 WORKER_SECONDS = 20.0  # for which a fleet waits for the first worker of a cluster
@@ -47,22 +48,26 @@ class Fleet:
         self.catalogue.put_all({name: _waiting(task) for name, task in self.tasks.items()})
         self.left = set(self.tasks)
         futures = {self._submit(client, name, place): name for place, name in enumerate(self.tasks)}
-        ended, looked = as_completed(futures), 0.0
-        while self.left:
-            try:
-                for future in ended.next_batch(block=False):
-                    if again := self._end(client, futures.pop(future), future):
-                        futures[again[0]] = again[1]
-                        ended.add(again[0])
-                if time.monotonic() > looked + POLL_SECONDS:
-                    self._watch(client, futures)
-                    looked = time.monotonic()
-            except (OSError, TimeoutError, RuntimeError) as error:
-                raise ClusterLostError(f"the cluster does not answer: {error}; the same command continues") from error
-            if client.status != "running":
-                raise ClusterLostError("the scheduler is gone; the same command continues where this one ended")
-            if self.left:
-                time.sleep(POLL_SECONDS / 5)
+        ended, looked, stop = as_completed(futures), 0.0, Stop()
+        with interrupts(stop, lambda sentence: None):  # an exception of the handler is lost in a destructor
+            while self.left:
+                try:
+                    for future in ended.next_batch(block=False):
+                        if again := self._end(client, futures.pop(future), future):
+                            futures[again[0]] = again[1]
+                            ended.add(again[0])
+                    if time.monotonic() > looked + POLL_SECONDS:
+                        self._watch(client, futures)
+                        looked = time.monotonic()
+                except (OSError, TimeoutError, RuntimeError) as error:
+                    remedy = "the same command continues"
+                    raise ClusterLostError(f"the cluster does not answer: {error}; {remedy}") from error
+                if client.status != "running":
+                    raise ClusterLostError("the scheduler is gone; the same command continues where this one ended")
+                if stop.finishing():
+                    raise KeyboardInterrupt
+                if self.left:
+                    time.sleep(POLL_SECONDS / 5)
 
     def _submit(self, client: Any, name: str, place: int) -> Any:
         """The future of a task; the smallest place runs first."""
