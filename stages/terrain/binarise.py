@@ -24,6 +24,7 @@ STATE_OF[[CellReason.UNOBSERVED, CellReason.OCCLUDED, CellReason.UNMATCHED, Cell
 RIM = 0.1  # m; cells this near to an obstacle are not free
 MIN_SUPPORT = 0.3  # share of the cells within a wheel's reach that are known, for a free cell
 MAX_DROP_DISTANCE = 1.0  # m through hidden cells, from where hidden ground is low to where it may begin to fall
+MIN_HOLE_SHARE = 1 / 3  # of min_drop; how low hidden ground is at least where matching may have narrowed a hole
 _SLOPE_ROUNDING = 1e-3  # rad, so that the rounding of float32 heights does not exceed a limit
 
 
@@ -145,6 +146,7 @@ class Binarise(Stage):
             "possibly too steep (steepness_error)": ~(steepness + self.steepness_error * (steepness - slope) <= limit),
             "on an obstacle that the edge of view cuts (min_rise)": self._cut(elevation, observed, above, step),
             "at a brink (min_drop)": self._brink(elevation),
+            "uneven at a hole of hidden ground (min_drop, min_rise)": self._at_hole(elevation, step),
             f"within {RIM:g} m of an obstacle": _dilated(obstacle, RIM / elevation.resolution),
         }
         if "variance" in elevation.layers:
@@ -179,6 +181,20 @@ class Binarise(Stage):
         for _ in range(reach if falls.any() else 0):
             falls = hidden & _dilated(falls, 1)
         return _dilated(falls, np.ceil(self.rover.wheel / 2 / elevation.resolution - 1e-6))
+
+    def _at_hole(self, elevation: ElevationMap, step: Array) -> Array:
+        """Uneven cells, (rows, cols) bool, beside low hidden ground, where this ground takes the room of a wheel.
+
+        Matching smears the near edge and the far wall of a ditch. Their heights fill most of it, and lift its ceiling.
+        """
+        if "drop" not in elevation.layers:
+            return np.zeros(elevation.shape, bool)
+        wheel = self.rover.wheel / elevation.resolution
+        low = (elevation.layers["occluded"] == 1) & (elevation.layers["drop"] >= MIN_HOLE_SHARE * self.min_drop)
+        uneven = (step >= self.min_rise) & _dilated(low, np.ceil(wheel / 2 - 1e-6) + 1)
+        count, hole = cv2.connectedComponents((low | uneven).view(np.uint8), connectivity=8)
+        area = np.bincount(hole.ravel(), low.ravel(), count)
+        return np.asarray(uneven & (area[hole] >= wheel**2 - 1e-6))
 
 
 def _shown(elevation: ElevationMap) -> Span:

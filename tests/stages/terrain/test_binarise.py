@@ -410,3 +410,23 @@ def test_a_low_flank_is_free_only_if_its_top_is_in_view(cut: bool, free: float) 
     assert flank.sum() > 5
     assert (result.cells[flank] == Cell.FREE).mean() == free
     assert (result.cells[seen & (np.hypot(x - 2, y - 2) > 0.9)] == Cell.FREE).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("cells", "drop", "step", "free"),
+    [(6, 0.05, 0.06, False), (5, 0.05, 0.06, True), (6, 0.02, 0.06, True), (6, 0.05, 0.03, True)],
+    ids=["a hole", "a hole smaller than a wheel", "hidden ground that is not low", "even ground"],
+)
+def test_uneven_ground_at_a_hole_of_hidden_ground_is_unsure(cells: int, drop: float, step: float, free: bool) -> None:
+    hole = np.zeros((40, 40), bool)
+    hole[17 : 17 + cells, 17 : 17 + cells] = True
+    layers = dict.fromkeys(("ground", "slope", "steepness", "roughness"), np.zeros(hole.shape))
+    layers |= {"elevation": np.where(hole, np.nan, 0), "step": np.full(hole.shape, step), "support": ~hole}
+    layers |= {"occluded": hole, "drop": np.where(hole, drop, np.nan)}
+    terrain = ElevationMap(
+        0, {name: layer.astype(np.float32) for name, layer in layers.items()}, 0.05, (0.0, 0.0), "level"
+    )
+    reason = Binarise()(terrain).reason
+    beside = binary_dilation(hole, np.ones((3, 3))) & ~hole
+    assert (reason[beside] == (CellReason.CLEAR if free else CellReason.UNSURE)).all()
+    assert (reason[:10] == CellReason.CLEAR).all()
