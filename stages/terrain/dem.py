@@ -82,7 +82,7 @@ class Voxelise(Stage):
     def __call__(self, cloud: PointCloud) -> ElevationMap:
         """The elevation map of a cloud in frame `level`."""
         check_level(self, cloud)
-        grid, layers = self.window(cloud)
+        grid, layers = self.in_view(cloud)
         placed = {}
         for name, layer in layers.items():
             placed[name] = np.full(self.whole.shape, 0 if name == "count" else np.nan, np.float32)
@@ -96,7 +96,7 @@ class Voxelise(Stage):
         corner = -half * self.resolution
         return Grid(self.resolution, (corner, corner), (2 * half, 2 * half), self.max_range)
 
-    def window(self, cloud: PointCloud) -> tuple[Grid, dict[str, Array]]:
+    def in_view(self, cloud: PointCloud) -> tuple[Grid, dict[str, Array]]:
         """The part of the grid that a levelled cloud shows, and its layers there, (rows, cols) float32."""
         whole = self.whole
         measured, guessed = self._split(cloud)

@@ -101,7 +101,7 @@ def frame_grid(cloud: PointCloud, level: Transform, resolution: float, max_range
     points = transform_points(cloud.points, rest.rotation, rest.translation)
     sensor = None if cloud.sensor is None else replace(rest.after(cloud.sensor), parent=LEVEL_FRAME)
     binning = Voxelise(resolution=resolution, max_range=max_range)
-    grid, layers = binning.window(replace(cloud, points=points, sensor=sensor))
+    grid, layers = binning.in_view(replace(cloud, points=points, sensor=sensor))
     rows, cols = _seen(layers)
     half = binning.whole.shape[0] // 2
     row, col = (int(cell[1 - axis]) - half + grid.first[axis] + (rows, cols)[axis].start for axis in (0, 1))
