@@ -46,17 +46,16 @@ def triangulate(
     Returns points (N, 3) float32 m, colors (N, 3) uint8, depth standard deviation (N,) float32 m, pixel (N,) int32.
     """
     return _triangulate(  # type: ignore[no-any-return]
-        np.ascontiguousarray(disparity.pixels).ravel(),
-        np.ascontiguousarray(disparity.source).ravel(),
-        np.ascontiguousarray(disparity.confidence).ravel(),
-        np.ascontiguousarray(colors).reshape(disparity.pixels.size, -1),
-        disparity.pixels.shape[1],
+        np.ascontiguousarray(disparity.pixels),
+        np.ascontiguousarray(disparity.source),
+        np.ascontiguousarray(disparity.confidence),
+        np.ascontiguousarray(colors).reshape(*disparity.pixels.shape, -1),
         (camera.fx, camera.fy, camera.cx, camera.cy, camera.fx * camera.baseline, camera.cx_right - camera.cx),
         float(max_depth),
         bool(filled),
         _dense_limits(camera, max_spacing),
         (float(np.log(sigma.best)), float(np.log(sigma.worst)), float(sigma.plane), float(sigma.filled)),
-        np.empty(0, np.float32) if disparity.sigma is None else np.ascontiguousarray(disparity.sigma).ravel(),
+        np.empty((0, 0), np.float32) if disparity.sigma is None else np.ascontiguousarray(disparity.sigma),
     )
 
 
@@ -68,51 +67,55 @@ def _dense_limits(camera: StereoCamera, max_spacing: float) -> Array:
 
 
 @part
-def _depth(disparity, source, shift, focal_baseline, max_depth, filled):
-    """Depth of a pixel, or 0 where it has no point."""
+def _has_point(effective, source, max_depth, focal_baseline, filled):
+    """Whether a pixel becomes a point, but for the spacing."""
     if source == _UNKNOWN or (source == _FILLED and not filled):
-        return 0.0
-    effective = disparity + shift
+        return False
     # NaN, a point behind the camera and a point beyond max_depth all fail this one comparison.
-    return focal_baseline / effective if effective * max_depth >= focal_baseline and np.isfinite(effective) else 0.0
+    return effective * max_depth >= focal_baseline and np.isfinite(effective)
 
 
 @kernel
-def _triangulate(disparity, source, confidence, colors, width, camera, max_depth, filled, dense, sigmas, own):
+def _triangulate(disparity, source, confidence, colors, camera, max_depth, filled, dense, sigmas, own):
     fx, fy, cx, cy, focal_baseline, shift = camera
     log_best, log_worst, sigma_plane, sigma_filled = sigmas
+    height, width = disparity.shape
     count = 0
-    for i in range(disparity.size):
-        if disparity[i] + shift < dense[i // width & 3, i % width & 3] and (
-            _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled) > 0.0
-        ):
-            count += 1
+    for row in range(height):
+        for col in range(width):
+            effective = np.float64(disparity[row, col]) + shift
+            if effective < dense[row & 3, col & 3]:
+                count += _has_point(effective, source[row, col], max_depth, focal_baseline, filled)
     points = np.empty((count, 3), np.float32)
     rgb = np.empty((count, 3), np.uint8)
     sigma = np.empty(count, np.float32)
     pixel = np.empty(count, np.int32)
-    green, blue = (1, 2) if colors.shape[1] == 3 else (0, 0)
+    green, blue = (1, 2) if colors.shape[2] == 3 else (0, 0)
     n = 0
-    for i in range(disparity.size):
-        z = 0.0
-        if disparity[i] + shift < dense[i // width & 3, i % width & 3]:
-            z = _depth(np.float64(disparity[i]), source[i], shift, focal_baseline, max_depth, filled)
-        if z > 0.0:
-            points[n, 0] = (i % width - cx) * z / fx
-            points[n, 1] = (i // width - cy) * z / fy
+    for row in range(height):
+        for col in range(width):
+            effective, origin = np.float64(disparity[row, col]) + shift, source[row, col]
+            if not effective < dense[row & 3, col & 3]:
+                continue
+            if not _has_point(effective, origin, max_depth, focal_baseline, filled):
+                continue
+            z = focal_baseline / effective
+            points[n, 0] = (col - cx) * z / fx
+            points[n, 1] = (row - cy) * z / fy
             points[n, 2] = z
-            rgb[n, 0], rgb[n, 1], rgb[n, 2] = colors[i, 0], colors[i, green], colors[i, blue]
-            if source[i] == _FILLED:
+            rgb[n, 0], rgb[n, 1] = colors[row, col, 0], colors[row, col, green]
+            rgb[n, 2] = colors[row, col, blue]
+            if origin == _FILLED:
                 sigma_d = sigma_filled
-            elif source[i] == _PLANE:
+            elif origin == _PLANE:
                 sigma_d = sigma_plane
             elif own.size:
-                sigma_d = np.float64(own[i])
+                sigma_d = np.float64(own[row, col])
             else:
-                trust = min(np.float64(confidence[i]), 1.0) if confidence[i] > 0.0 else 0.0
+                trust = min(np.float64(confidence[row, col]), 1.0) if confidence[row, col] > 0.0 else 0.0
                 sigma_d = np.exp(log_worst + (log_best - log_worst) * trust)
             sigma[n] = z * z / focal_baseline * sigma_d
-            pixel[n] = i
+            pixel[n] = row * width + col
             n += 1
     return points, rgb, sigma, pixel
 
