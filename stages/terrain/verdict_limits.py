@@ -13,7 +13,6 @@ from stages.terrain.binarise import Binarise
 
 FACTORS = tuple(1.1**step for step in range(1, 25))  # by which a parameter is changed, up to ten times its value
 PRECISION = 0.01  # of a parameter that would turn the verdict
-NEIGHBOURHOOD = 2.0  # m around a cell that its verdict may depend on
 _LIMITS = ("max_step", "ground_clearance", "max_slope")  # of the rover
 
 
@@ -60,8 +59,7 @@ def doubts_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list
     """In words, all that keeps the rule from calling a cell without a hazard free."""
     if math.isnan(terrain.layers["elevation"][row, col]):
         return []
-    part, row, col = _around(terrain, row, col)
-    return [doubt for doubt, cells in rule.doubts(part).items() if cells[row, col]]
+    return [doubt for doubt, cells in rule.doubts(terrain).items() if cells[row, col]]
 
 
 def limits_of(rule: Binarise) -> dict[str, float]:
@@ -82,11 +80,10 @@ def _height(rule: Binarise, value: float, name: str) -> Limit:
 
 def turns_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[Turn]:
     """The smallest change of each parameter of the rule that turns the verdict of a cell, the smallest first."""
-    part, row, col = _around(terrain, row, col)
-    verdict = int(rule(part).cells[row, col])
+    verdict = int(rule(terrain).cells[row, col])
     found = list[tuple[float, Turn]]()
     for name, value, unit in _numbers(rule):
-        changes = [_turned(rule, name, value, (part, row, col), verdict, up) for up in (True, False)]
+        changes = [_turned(rule, name, value, (terrain, row, col), verdict, up) for up in (True, False)]
         known = [change for change in changes if change is not None]
         if known:
             factor, turned = min(known, key=lambda change: abs(math.log(change[0])))
@@ -119,15 +116,6 @@ def _turned(
     return high, Cell(turned)
 
 
-def _around(terrain: ElevationMap, row: int, col: int) -> tuple[ElevationMap, int, int]:
-    """The part of a map that the verdict of a cell depends on, and the cell in it."""
-    reach = math.ceil(NEIGHBOURHOOD / terrain.resolution)
-    top, left = max(0, row - reach), max(0, col - reach)
-    part = {name: layer[top : row + reach + 1, left : col + reach + 1] for name, layer in terrain.layers.items()}
-    origin = (terrain.origin[0] + left * terrain.resolution, terrain.origin[1] + top * terrain.resolution)
-    return ElevationMap(terrain.stamp, part, terrain.resolution, origin, terrain.frame_id), row - top, col - left
-
-
 def _numbers(rule: Binarise) -> Iterator[tuple[str, float, str]]:
     """(Name, value, unit) of the rule's limits."""
     for known in fields(rule.rover):
@@ -144,11 +132,11 @@ def _like(now: float, value: float) -> float:
     return round(value) if isinstance(now, int) else value
 
 
-def _verdict(rule: Binarise, name: str, value: float, part: ElevationMap, row: int, col: int) -> int | None:
+def _verdict(rule: Binarise, name: str, value: float, terrain: ElevationMap, row: int, col: int) -> int | None:
     """The verdict with another value of a parameter; None where the rule does not allow the value."""
     change: dict[str, Any] = {name.removeprefix("rover."): value}
     try:
         changed = replace(rule, **({"rover": replace(rule.rover, **change)} if name.startswith("rover.") else change))
     except ValueError:
         return None
-    return int(changed(part).cells[row, col])
+    return int(changed(terrain).cells[row, col])

@@ -14,7 +14,7 @@ from scipy.ndimage import binary_dilation
 from stages.data import Array, Cell, CellReason, ElevationMap, MatchFailure, NavigationMap, Rover
 from stages.terrain.binarise import Binarise
 from stages.terrain.features import TerrainFeatures
-from stages.terrain.verdict_limits import doubts_at
+from stages.terrain.verdict_limits import doubts_at, turns_at
 from tests.stages.terrain.terrain_scene import Terrain, map_of, rolling_terrain
 
 TEN_DEGREES = float(np.deg2rad(10))
@@ -410,6 +410,17 @@ def test_a_low_flank_is_free_only_if_its_top_is_in_view(cut: bool, free: float) 
     assert flank.sum() > 5
     assert (result.cells[flank] == Cell.FREE).mean() == free
     assert (result.cells[seen & (np.hypot(x - 2, y - 2) > 0.9)] == Cell.FREE).mean() > 0.9
+
+
+def test_a_wall_that_the_edge_of_view_cuts_far_away_names_its_doubt() -> None:
+    x, y = grid(160)
+    seen = y < 6.5
+    height = np.where(seen, np.where((y > 1) & (abs(x - 4) < 0.15), 0.12, 0.0), np.nan)
+    terrain = TerrainFeatures()(map_of(height, occluded=np.where(seen, 0.0, np.nan)))
+    rule, (row, col) = Binarise(), (30, 80)
+    assert rule(terrain).reason[row, col] == CellReason.UNSURE
+    assert doubts_at(rule, terrain, row, col) == ["on an obstacle that the edge of view cuts (min_rise)"]
+    assert "min_rise" in [turn.parameter for turn in turns_at(rule, terrain, row, col)]
 
 
 @pytest.mark.parametrize(
