@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from flow.config.loader import SHIPPED
+from flow.config.templates import SHIPPED
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import read_disparity

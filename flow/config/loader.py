@@ -13,7 +13,7 @@ from typing import Any
 
 from flow.config.node_spec import NodeSpec, mapping, place_at_fault, type_name
 from flow.config.overrides import Change, with_settings
-from flow.config.templates import Expansion, Library, Scope, resolved
+from flow.config.templates import SHIPPED, Expansion, Library, Scope, resolved
 from flow.config.yaml_tree import Value, nearest, read
 from flow.errors import UsageError
 from flow.runtime.graph import (
@@ -29,7 +29,6 @@ from flow.runtime.graph import (
     unfit,
 )
 
-SHIPPED = Path(__file__).parent.parent / "pipelines"
 _KEYS = ("settings", "source", "templates", "streams", "sinks")
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 
@@ -63,7 +62,7 @@ def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> G
     _check_parts(tree)
     own = mapping(tree.value["templates"], "'templates'") if "templates" in tree.value else {}
     streams = mapping(tree.value["streams"], "'streams'")
-    library = Library(path, SHIPPED, own)
+    library = Library(own)
     expansion = Expansion(streams, library, changes)
     sinks = tree.value["sinks"].value if with_sinks else []
     return _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)

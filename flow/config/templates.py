@@ -1,7 +1,7 @@
 """Templates: named groups of streams with inputs, parameters and one output, expanded when a pipeline is loaded.
 
 A use of a template makes the stream of its own name, which is the template's output. The other streams of the template
-are called `use/stream`. A template is found in the pipeline file, in a YAML file beside it, or in the shipped parts.
+are called `use/stream`. A template is found in the pipeline file or among the parts that ship.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from flow.config.overrides import Change, filled_in
 from flow.config.yaml_tree import Value, nearest, read
 from flow.runtime.graph import TemplateUse, YamlLocation, ports_of
 
+SHIPPED = Path(__file__).parent.parent / "pipelines"
 _KEYS = ("inputs", "parameters", "output", "streams")
 
 
@@ -110,10 +111,9 @@ def check_name(name: str, place: YamlLocation) -> None:
 
 
 class Library:
-    """Finds templates by name: in the pipeline file, in files beside it, and in the shipped parts."""
+    """Finds templates by name: in the pipeline file, and among the parts that ship."""
 
-    def __init__(self, file: Path, shipped: Path, own: Mapping[str, Value]) -> None:
-        self._file, self._shipped = file, shipped
+    def __init__(self, own: Mapping[str, Value]) -> None:
         self._known = {name: Template.read(name, item) for name, item in own.items()}
         self._texts: dict[str, str] = {}
 
@@ -123,7 +123,7 @@ class Library:
         return "".join(f"# {line}\n" for line in lines)
 
     def find(self, name: Value) -> Template:
-        """The template that `template: name` means: a name, or the path of a YAML file from the pipeline's folder."""
+        """The template that `template: name` means."""
         if not isinstance(name.value, str) or not name.value:
             raise name.place.error(f"'template: {name.plain()}' must be the name of a template")
         if name.value not in self._known:
@@ -131,23 +131,13 @@ class Library:
         return self._known[name.value]
 
     def _read(self, name: Value) -> Template:
-        folder, parts = self._file.parent, f"parts/{name.value}.yaml"
-        is_path = name.value.endswith((".yaml", ".yml"))
-        places = [folder / name.value] if is_path else [folder / parts, self._shipped / parts]
-        found = next((place for place in places if place.is_file()), None)
-        if found is None:
-            files = [*(folder / "parts").glob("*.yaml"), *(self._shipped / "parts").glob("*.yaml")]
-            meant = nearest(name.value, [*self._known, *(file.stem for file in files)])
-            raise name.place.error(
-                f"there is no template '{name.value}'{meant or f' under templates or in {places[0]}'}"
-            )
-        try:
-            text = found.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise name.place.error(f"cannot read the template {found}: {error}") from error
-        shown = name.value if is_path else parts
+        parts = {file.stem: file for file in (SHIPPED / "parts").glob("*.yaml")}
+        if name.value not in parts:
+            meant = nearest(name.value, [*self._known, *parts]) or "; write it under 'templates' of the pipeline file"
+            raise name.place.error(f"there is no template '{name.value}'{meant}")
+        shown, text = f"parts/{name.value}.yaml", parts[name.value].read_text(encoding="utf-8")
         self._texts[shown] = text
-        return Template.read(found.stem, read(text, lambda line: YamlLocation(shown, line)))
+        return Template.read(name.value, read(text, lambda line: YamlLocation(shown, line)))
 
 
 class Expansion:

@@ -16,7 +16,8 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 
 from flow.cli.main import parser
-from flow.config.loader import SHIPPED, load
+from flow.config.loader import load
+from flow.config.templates import SHIPPED
 from recordings import McapSource
 from recordings.calibration.formats import read_calibration
 from recordings.containers.finding import find_files

@@ -18,7 +18,8 @@ from typing import Any
 from flow.cli.fleet.jobs import Job
 from flow.cli.replay import product_version, replay
 from flow.cli.report import by_cause
-from flow.config.loader import SHIPPED, load, shipped
+from flow.config.loader import load, shipped
+from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, UsageError
 from flow.runtime.findings import lines
@@ -40,12 +41,12 @@ class Pipeline:
 
     @classmethod
     def of(cls, name: str, changes: tuple[str, ...]) -> Pipeline:
-        """The pipeline `name`, as `load` takes it; a file takes the .py and .yaml files beside it along."""
+        """The pipeline `name`, as `load` takes it; a file takes the .py files beside it along."""
         if name in shipped():
             return cls(name, {}, changes)
         path = Path(name)
         load(name, changes)  # refuses a wrong one at once
-        beside = [path, *(file for pattern in ("*.py", "*.yaml") for file in sorted(path.parent.glob(pattern)))]
+        beside = [path, *sorted(path.parent.glob("*.py"))]
         small = {file.name: file.read_bytes() for file in beside if file.stat().st_size <= MAX_FILE_BYTES}
         return cls(path.name, small, changes)
 

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from flow.config.draw import draw
-from flow.config.loader import SHIPPED, load, shipped
+from flow.config.loader import load, shipped
+from flow.config.templates import SHIPPED
 from flow.errors import PipelineError
 
 TOY = """\
@@ -112,6 +113,8 @@ def test_optional_applies_to_the_inner_streams(tmp_path):
     [
         ("{template: scaled_twice", "{template: scald_twice",
          "toy.yaml:13: there is no template 'scald_twice'; did you mean 'scaled_twice'?"),
+        ("{template: scaled_twice", "{template: mine.yaml",
+         "toy.yaml:13: there is no template 'mine.yaml'; write it under 'templates' of the pipeline file"),
         ("couple: both, factor", "factor",
          "toy.yaml:13: 'out' lacks its input 'couple' (template 'scaled_twice' needs it)"),
         ("both, factor:", "both, faktor:",
@@ -176,21 +179,6 @@ def test_a_template_that_uses_itself_is_refused(tmp_path):
 )  # fmt: skip
 def test_a_bad_setting_of_a_template_is_named(tmp_path, override, message):
     assert refusal(tmp_path, overrides=[override]).startswith(f"--set {override}: {message}")
-
-
-def test_a_template_is_found_in_a_file_beside_the_pipeline(tmp_path):
-    own = TOY[TOY.index("    inputs:") : TOY.index("source:")]
-    text = TOY[: TOY.index("templates:")] + TOY[TOY.index("source:") :]
-    (tmp_path / "parts").mkdir()
-    (tmp_path / "parts" / "scaled_twice.yaml").write_text(textwrap.dedent(own))
-    assert factors(loaded(tmp_path, text)) == {"out/first": 0.25, "out": 3.0}
-    (tmp_path / "another.yaml").write_text(textwrap.dedent(own).replace("3 m", "4 m"))
-    by_path = text.replace("template: scaled_twice", "template: another.yaml")
-    graph = loaded(tmp_path, by_path)
-    assert factors(graph) == {"out/first": 0.25, "out": 4.0}
-    assert "# another.yaml:\n# inputs: {couple: Couple}\n" in graph.text  # so that the result log contains it
-    (tmp_path / "another.yaml").write_text(textwrap.dedent(own).replace("3 m", "4 s"))
-    assert refusal(tmp_path, by_path).startswith("another.yaml:2: tests.flow.toys.Scale.factor: '4 s' is a time")
 
 
 def test_graph_draws_a_template_as_one_box_or_its_streams(tmp_path):
