@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -112,7 +113,7 @@ def unpack_chunk(content: bytes) -> bytes | memoryview:
 
 
 def chunk_heads(file: BinaryIO, position: int, offsets: Sequence[int], size: int) -> Iterator[bytes]:
-    """The first `size` bytes of the records at ascending offsets of a chunk, without checking its CRC.
+    """At most `size` first bytes of the records at ascending offsets of a chunk, without checking its CRC.
 
     Of a chunk that is not compressed, only these bytes are read. position: of the chunk record's content.
     """
@@ -124,10 +125,10 @@ def chunk_heads(file: BinaryIO, position: int, offsets: Sequence[int], size: int
     elif compression == "zstd":
         file.seek(content)
         stream, at = zstandard.ZstdDecompressor().stream_reader(file, closefd=False), 0
-        for offset in offsets:
+        for offset, following in pairwise([*offsets, 1 << 62]):
             while at < offset and (skipped := len(stream.read(min(offset - at, _BLOCK_BYTES)))):
                 at += skipped
-            found = stream.read(size)
+            found = stream.read(min(size, following - offset))
             yield found
             at += len(found)
     else:

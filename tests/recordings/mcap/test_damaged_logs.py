@@ -14,19 +14,22 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Statistics
-from mcap.writer import CompressionType, IndexType
+from mcap.writer import CompressionType, IndexType, Writer
 
 from recordings import McapSource
 from recordings.containers.container import LostMessage
+from recordings.containers.header import peek_stamp
+from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from recordings.inventory.text import format_description
 from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
 from tests.conftest import chunks_of, data_folder, rewrite, with_broken, write_mcap
-from tests.recordings.sample_log import LAYOUTS, LEFT, RIGHT, essences, inventory_of, items_of, sound
+from tests.recordings.sample_log import LAYOUTS, LEFT, PERIOD, RIGHT, START, essences, inventory_of, items_of, sound
 
 
 def record(opcode: int, content: bytes) -> bytes:
@@ -315,3 +318,18 @@ def test_messages_of_an_undefined_channel_are_reported(tmp_path):
     assert [item.reason for item in found if isinstance(item, LostMessage)] == [
         "1 message of channel 999 cannot be read: the log does not define it"
     ]
+
+
+def test_the_starts_of_short_messages_in_one_chunk_are_their_own(tmp_path):
+    stamps = [START + number * PERIOD for number in range(2)]
+    with (path := tmp_path / "log.mcap").open("wb") as file:
+        (writer := Writer(file)).start()
+        schema = writer.register_schema("geometry_msgs/msg/Vector3Stamped", "ros2msg", b"std_msgs/Header header\n")
+        channel = writer.register_channel("/inclinometer", "cdr", schema)
+        for number, stamp in enumerate(stamps):
+            data = b"\0\1\0\0" + struct.pack("<II", *divmod(stamp, 10**9)) + bytes(40)
+            # Its second byte is the opcode of a message.
+            writer.add_message(channel, stamp, data, stamp, sequence=Opcode.MESSAGE << 8 | number)
+        writer.finish()
+    with open_recording(path) as log:
+        assert [peek_stamp(head.data) for head in log.heads({channel})] == stamps
