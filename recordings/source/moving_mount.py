@@ -93,8 +93,9 @@ class MovingMount:
 
     def first(self) -> Mount:
         """The mount at the first time at which all transforms are known."""
-        stamps = sorted(stamp for stamp, _ in chain.from_iterable(self.samples.values()))
-        for stamp in stamps:
+        unusable = f"no message of {', '.join(self.topics)} can be used for the mount of the camera"
+        why = LogError(f"{unusable}; record rotations as unit quaternions, and a position with each joint")
+        for stamp in sorted(stamp for stamp, _ in chain.from_iterable(self.samples.values())):
             try:
                 return self.at(stamp)
             except LogError as error:

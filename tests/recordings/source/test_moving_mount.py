@@ -208,6 +208,23 @@ def test_a_wrong_file_of_joints_is_refused(tmp_path, content, sentence):
         assert "cannot read the file of joints" in log.refused["joints"]
 
 
+def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
+    def turned(stamp):
+        message = transform_message([(pan(stamp), stamp)])
+        message.transforms[0].transform.rotation.w = message.transforms[0].transform.rotation.z = 0.0
+        return {"/tf": message}
+
+    def unmoved(stamp):
+        (message := angles(stamp)["/joints"]).position = np.zeros(0)
+        return {"/joints": message}
+
+    (file := tmp_path / "mast.yaml").write_text(MAST)
+    for messages, topic, joints_file in ((turned, "/tf", None), (unmoved, "/joints", str(file))):
+        path = written(tmp_path / f"{messages.__name__}.mcap", messages)
+        with McapSource(joints=joints_file).open(path) as log:
+            assert log.missing["mount"].startswith(f"no message of {topic} can be used for the mount of the camera; ")
+
+
 def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
     file = tmp_path / "mast.yaml"
     file.write_text("turret: {parent: base_link, child: mast, axis: [0, 0, 1]}")
