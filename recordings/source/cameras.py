@@ -129,9 +129,8 @@ def mismatched_images(
 def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
     """The first (or last) image that can be decoded, or the last error; None without messages."""
     found, pixels_of = None, messages.pixel_reader(topic)
-    if isinstance(pixels_of, VideoDecoder):
-        return messages.first(topic, pixels_of)
-    for found in (messages.last if last else messages.sample)(topic, pixels_of):
+    some = messages.each if isinstance(pixels_of, VideoDecoder) else messages.last if last else messages.sample
+    for found in some(topic, pixels_of):
         if not isinstance(found, LogError):
             break
     return found

@@ -28,7 +28,7 @@ from recordings.source.transforms import TransformTree, are_same
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
-_MAX_TRANSFORMS = 100  # messages looked at, from the first one with the rover
+_MAX_TRANSFORMS = 200  # messages of each part of a log that are looked at, as many place other frames
 _MAX_LISTED = 5  # topics in a sentence
 
 
@@ -289,13 +289,10 @@ class SourceResolution:
 
     def _no_pose_reason(self, topic: str) -> str | None:
         """Why the transforms of a topic are not the pose of the base frame; None if they are."""
-        base, parents, seen = self.source.base_frame, dict[str, set[str]](), 0
-        for message in self.messages.each(topic, lambda message: message.transforms):
+        base, parents = self.source.base_frame, dict[str, set[str]]()
+        for message in self.messages.sample(topic, lambda message: message.transforms, _MAX_TRANSFORMS):
             for item in [] if isinstance(message, LogError) else message:
                 parents.setdefault(frame_name(item.child_frame_id), set()).add(frame_of(item))
-            seen += base in parents
-            if seen == _MAX_TRANSFORMS:
-                break
         if base not in parents:
             others = ", ".join(f"'{child}'" for child in sorted(parents)[:_MAX_LISTED]) or "nothing"
             return f"no transform places '{base}' (they place {others}); set 'base_frame' of the source to the rover's"

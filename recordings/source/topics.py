@@ -159,23 +159,22 @@ class DecodedTopics:
             elif raw.channel is not None:
                 yield _GoneError(raw.reason)
 
-    def sample(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
-        """Convert some messages of a topic, spread over the log, without lost ones."""
+    def sample(self, topic: str, make: Callable[[Any], T], most: int | None = None) -> Iterator[T | LogError]:
+        """Convert some messages of a topic, spread over the log, without lost ones. most: of each part."""
         for place in range(_SAMPLE_PLACES):
             start = self.file.start + (self.file.end - self.file.start) * place // _SAMPLE_PLACES
             made = self.each(topic, make, start, allow_repeats=True)
-            yield from islice((each for each in made if not isinstance(each, _GoneError)), _MAX_SAMPLES)
+            yield from islice((each for each in made if not isinstance(each, _GoneError)), most or _MAX_SAMPLES)
 
     def last(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
         """Convert the messages of a topic at its last log time."""
         return self.each(topic, make, max(self.file.times(self.channels_of(topic)).tolist(), default=None))
 
     def first(self, topic: str, make: Callable[[Any], T]) -> T | LogError:
-        """Convert the first message for which this succeeds; otherwise the last LogError."""
-        made: T | LogError = LogError(f"{topic} has no messages")
-        for made in self.each(topic, make):
-            if not isinstance(made, LogError):
-                return made
+        """Convert the first message, or the first of a sample for which this succeeds; otherwise the LogError."""
+        made = next(self.each(topic, make), LogError(f"{topic} has no messages"))
+        if isinstance(made, LogError):
+            made = next((each for each in self.sample(topic, make) if not isinstance(each, LogError)), made)
         return made
 
     def frame_of(self, topic: str) -> str:

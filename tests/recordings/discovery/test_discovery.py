@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
+from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import camera_info, image, odometry, transform_message
 from stages.data import Pose, Transform
@@ -114,10 +115,10 @@ def test_a_pose_among_results_is_named_but_not_used(tmp_path):
 ODOM, MAP, WHEEL = ("odom", "base_link"), ("map", "odom"), ("base_link", "wheel")
 
 
-def moving(path: Path, *links: tuple[str, str]) -> Path:
+def moving(path: Path, *links: tuple[str, str], count: int = 5) -> Path:
     """A log of transforms that move, each link (parent, child) in messages of its own."""
     with Ros2Writer(path) as writer:
-        for stamp in range(START, START + 5 * PERIOD, PERIOD):
+        for stamp in range(START, START + count * PERIOD, PERIOD):
             for link in links:
                 at = Transform(*link, np.eye(3), [stamp - START, 0.0, 0.0])
                 writer.write("/tf", transform_message([(at, stamp)]), stamp)
@@ -138,6 +139,18 @@ def moving(path: Path, *links: tuple[str, str]) -> Path:
 def test_transforms_with_no_pose_or_two_are_refused(tmp_path, links, sentence):
     with McapSource(odometry="/tf").open(moving(tmp_path / "log.mcap", *links)) as log:
         assert f"the source's 'odometry' is set to /tf, where {sentence}" in log.refused["odometry"]
+
+
+def test_a_topic_that_supplies_nothing_is_judged_by_a_sample(tmp_path, monkeypatch):
+    path, seen = moving(tmp_path / "log.mcap", WHEEL, count=2000), []
+    monkeypatch.setattr("recordings.source.resolution.frame_name", lambda name: seen.append(name) or name)
+    with McapSource(odometry="/tf").open(path) as log:
+        assert "no transform places 'base_link'" in log.refused["odometry"]
+        assert len(seen) <= 800
+        seen.clear()
+        failed = log.resolution.messages.first("/tf", lambda message: seen.append(message) or message.pitch)
+    assert isinstance(failed, LogError)
+    assert len(seen) <= 81
 
 
 @pytest.mark.parametrize("links", [(WHEEL, MAP, ODOM), (("/odom", "/base_link"),)], ids=["map", "leading slash"])
