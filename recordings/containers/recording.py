@@ -72,13 +72,14 @@ class _Part:
     def whole(self) -> bool:
         return len(self.places) == len(self.file.timeline)
 
-    @property
-    def start(self) -> int:
-        """No message of the part is earlier, ns."""
-        if self.whole:
-            return self.file.start + self.step.shift
-        times = self.file.timeline.log_times[self.places.start : self.places.stop]
-        return int(np.min(times[times >= 0], initial=self.file.end)) + self.step.shift
+    @cached_property
+    def ends(self) -> tuple[int, int]:
+        """No message of the part is earlier than the first log time, and none later than the last, ns."""
+        start, end = self.file.start, self.file.end
+        if not self.whole:
+            times = self.file.timeline.log_times[self.places.start : self.places.stop]
+            start, end = int(np.min(times[times >= 0], initial=end)), int(np.max(times, initial=start))
+        return start + self.step.shift, end + self.step.shift
 
     def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
         """The log times of some channels of the recording, ns, in any order."""
@@ -142,8 +143,8 @@ class Recording:
         self.channels, self._numbers = _merged_channels(files)
         self._stamped = {number for number, channel in self.channels.items() if begins_with_header(channel)}
         try:
-            self.start = min(part.start for part in self._parts)
-            self.end = max(part.file.end + part.step.shift for part in self._parts)
+            self.start = min(part.ends[0] for part in self._parts)
+            self.end = max(part.ends[1] for part in self._parts)
         except BaseException:
             self.close()
             raise
@@ -208,7 +209,7 @@ class Recording:
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of all parts, in log-time order."""
         begun = list[Iterator[RawMessage | LostMessage] | None]([None] * len(self._parts))
-        queue: list[tuple[int, int, Any]] = [(part.start, number, None) for number, part in enumerate(self._parts)]
+        queue: list[tuple[int, int, Any]] = [(part.ends[0], number, None) for number, part in enumerate(self._parts)]
         heapify(queue)
         while queue:
             log_time, number, item = heappop(queue)

@@ -7,6 +7,8 @@ import pytest
 
 from recordings import McapSource
 from recordings.containers.clock import MAX_JITTER_NS
+from recordings.containers.opening import open_recording
+from recordings.errors import LogError
 from tests.conftest import Row, mcap_rows, rewrite
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essences, inventory_of, items_of, sound
 
@@ -65,6 +67,17 @@ def test_a_recorder_whose_clock_alone_is_set_back_loses_nothing(sample, whole, t
     assert description["frames"]["with_tilt"] == FRAMES
     note = f"the recorder's clock was set back by {back / 1e9:.3g} s, and its log times are corrected by header stamps"
     assert description["notes"]["left"] == note
+
+
+def test_the_end_is_that_of_the_corrected_log_times(sample, tmp_path):
+    def time(topic, log_time):
+        return log_time - (50 * PERIOD if (log_time - START) // PERIOD == FIRST else 0)
+
+    path = rewrite(sample, tmp_path / "log.mcap", time=time)
+    with open_recording(path) as log, open_recording(sample) as right:
+        assert abs(log.end - right.end) < 10_000_000
+    with pytest.raises(LogError, match="start 1 s is after its end"):
+        McapSource().open(path, start=1)
 
 
 def by_topic(rows: list[Row]) -> list[Row]:
