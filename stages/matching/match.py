@@ -1,7 +1,7 @@
 """Semi-global matching (Hirschmüller, 2008; section 3.1 of the paper), compiled, on one or two threads.
 
-The cost is the census transform, by default with the truncated gradient difference, smoothed over 3x3. Byte vectors
-hold the sums of 8 paths. One pass over these sums gives the disparity, its fraction of a pixel and the left-right check
+The cost is the census transform with the truncated gradient difference, smoothed over 3x3. Byte vectors hold the sums
+of 8 paths. One pass over these sums gives the disparity, its fraction of a pixel and the left-right check
 (stages.matching.kernels.semiglobal).
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from stages.matching.far_rows import far_rows
 from stages.matching.image_noise import frame_noise
 from stages.matching.intensity import gray_pair
 from stages.matching.kernels.gradient import steep_slope
-from stages.matching.kernels.matching_inputs import NO_SLOPE
 from stages.matching.kernels.prior_cost import MAX_GAIN, prior_costs
 from stages.matching.kernels.row_ranges import Range, lanes_for, row_ranges, whole_range
 from stages.matching.kernels.semiglobal import Matches, match
@@ -33,35 +31,19 @@ from stages.stage import Stage, check_rectified, parameter
 
 F32 = np.float32
 MIN_SIDE = 16  # px, of an image
-MAX_BYTE = 255
 RANGE_TOLERANCE = 2.0  # px; a prior farther outside the search range shows that the match is not in it
+MAX_BYTE, MAX_COST = 255, 59  # of the sums of paths, and of the cost
 P2_EDGE_SCALE = 10.0  # gray levels, the step of brightness that halves p2
 MAX_PRIOR_DISTANCE = 4.0  # px, from which the prior's cost grows no more
 SPECKLE_RANGE = 1.0  # px, the disparity step that separates patches
 SearchArea = SearchWindows | list[Range]
 
 
-class Cost(NamedTuple):
-    """A matching cost and the constants that suit it, fitted to the eight quarter-size Middlebury scenes."""
-
-    max_cost: int
-    unseen_cost: int  # where the partner lies outside the right image
-    p1: int
-    p2: int
-    # Share of matches within 1 px of the truth, by their lead (`LEADS`): the difference between the best sum of paths
-    # and the best of all but its neighbours. Occluded pixels count, every scene counts the same. Monotone fit.
-    confidence: tuple[float, ...]
-
-
+# Share of matches within 1 px of the truth, by their lead: the difference between the best sum of paths and the best of
+# all but its neighbours. On the eight quarter-size Middlebury scenes: occluded pixels count, every scene counts the
+# same, monotone fit.
 LEADS = (0, 20, 40, 60, 80, 100, 120, 140, 160, 180, 200, 220, 240, 254, 255)
-COSTS = {
-    "census": Cost(24, 12, 12, 70, (
-        .50, .595, .703, .806, .876, .925, .956, .973, .983, .989, .993, .996, .997, .998, .998,
-    )),
-    "census+gradient": Cost(59, 40, 16, 100, (
-        .45, .492, .553, .632, .703, .767, .821, .866, .894, .923, .958, .975, .980, .987, .994,
-    )),
-}  # fmt: skip
+CONFIDENCES = (.45, .492, .553, .632, .703, .767, .821, .866, .894, .923, .958, .975, .980, .987, .994)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -92,20 +74,19 @@ class Match(Stage):
     )
     min_disparity: int = parameter(0, "smallest disparity searched", unit="px", low=-1024, high=1024)
     max_depth: float = parameter(0.0, "depth beyond which disparities are not searched; 0: no limit", unit="m", low=0)
-    cost: str = parameter("census+gradient", "matching cost", choices=tuple(COSTS))
     paths: int = parameter(8, "directions of aggregation", choices=(4, 8))
     p1: int = parameter(
-        0, "penalty of a disparity step of 1 px, in units of the cost (census: bits that differ; with the gradient 1.5"
-        " per bit); 0: suits the cost",
-        low=0, high=100,
-    )  # fmt: skip
+        16,
+        "penalty of a disparity step of 1 px, in units of the cost (1.5 per bit of census that differs)",
+        low=0,
+        high=100,
+    )
     p2: int = parameter(
-        0, "penalty of a larger step where the image has no edge; 0: suits the cost", low=0, high=230
-    )  # fmt: skip
+        100, "penalty of a larger step where the image has no edge; above p1", low=0, high=MAX_BYTE - MAX_COST
+    )
     unseen_cost: int = parameter(
-        0, "cost of a partner outside the right image; 0: suits the cost. A match without a good prior needs more, or "
-        "it prefers such partners to those of near ground",
-        low=0, high=59,
+        40, "cost of a partner outside the right image. A match without a good prior needs more, or it prefers such "
+        "partners to those of near ground", low=0, high=MAX_COST,
     )  # fmt: skip
     uniqueness: int = parameter(0, "margin by which the best sum of paths must beat the next", low=0, high=254)
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
@@ -157,17 +138,8 @@ class Match(Stage):
         super().__post_init__()
         if self.search_radius and self.band_height:
             raise ValueError("Match.band_height has no effect with Match.search_radius; set one of them to 0")
-        if self.follow_slopes and self.cost == "census":
-            raise ValueError("Match.follow_slopes has no effect with cost census; set it to false")
-        max_cost, (p1, p2) = COSTS[self.cost].max_cost, self._penalties()
-        if not p2 > p1:
-            raise ValueError(f"Match.p2 must be above Match.p1 = {p1}, not {p2}")
-        if self.unseen_cost > max_cost:
-            raise ValueError(
-                f"Match.unseen_cost must be at most {max_cost} with cost {self.cost}, not {self.unseen_cost}"
-            )
-        if max_cost + p2 > MAX_BYTE:
-            raise ValueError(f"Match.p2 must be at most {MAX_BYTE - max_cost} with cost {self.cost}, not {p2}")
+        if not self.p2 > self.p1:
+            raise ValueError(f"Match.p2 must be above Match.p1 = {self.p1}, not {self.p2}")
 
     def check_inputs(self, inputs: Collection[str]) -> None:
         """Raise ValueError if a setting needs a prior that is not among the `inputs`, names of ports."""
@@ -192,11 +164,12 @@ class Match(Stage):
         left, right = frame.once(gray_pair)
         search = self._search_range(frame.camera)
         area = self._search_area(prior, search, len(left))
-        guide = None
+        guide: tuple[Array, ...] | None = None
         if prior is not None:
             gain, left, right = self._noise_measures(prior, frame)
-            slope = steep_slope(prior.pixels) if self.follow_slopes else NO_SLOPE
-            guide = *self._prior_costs(prior, search, area, gain), slope
+            guide = self._prior_costs(prior, search, area, gain)
+            if self.follow_slopes:
+                guide = *guide, steep_slope(prior.pixels)
         excluded = None if prior is None else self._excluded(prior, search, area)
         found = match(left, right, self._params(search), guide, area, excluded, self.threads, self.max_memory << 20)
         if prior is not None and self.out_of_range == "prior" and not self.search_radius:
@@ -298,21 +271,15 @@ class Match(Stage):
         excluded &= prior.source == PixelOrigin.MEASURED
         return excluded * np.uint8(PixelOrigin.OUT_OF_RANGE)
 
-    def _penalties(self) -> tuple[int, int]:
-        cost = COSTS[self.cost]
-        return self.p1 or cost.p1, self.p2 or cost.p2
-
     def _params(self, search: range) -> SgmParams:
-        cost, (p1, p2) = COSTS[self.cost], self._penalties()
-        falling = np.maximum(p1 + 2, np.round(p2 / (1 + np.arange(256) / P2_EDGE_SCALE)))
-        confidence = np.interp(np.arange(256), LEADS, cost.confidence).astype(np.float32)
+        falling = np.maximum(self.p1 + 2, np.round(self.p2 / (1 + np.arange(256) / P2_EDGE_SCALE)))
+        confidence = np.interp(np.arange(256), LEADS, CONFIDENCES).astype(np.float32)
         confidence[0] = 0  # unknown
         return SgmParams(
-            gradient=self.cost == "census+gradient", diagonals=self.paths == 8, p1=p1,
-            p2_table=np.minimum(falling, p2).astype(np.uint8), unseen_cost=self.unseen_cost or cost.unseen_cost,
-            disparities=len(search), min_disparity=search.start, uniqueness=self.uniqueness,
-            lr_tolerance=self.lr_tolerance, speckle_range=SPECKLE_RANGE, max_speckle_size=self.max_speckle_size,
-            confidence_of=confidence, keep_costs=self.keep_costs,
+            diagonals=self.paths == 8, p1=self.p1, p2_table=np.minimum(falling, self.p2).astype(np.uint8),
+            unseen_cost=self.unseen_cost, disparities=len(search), min_disparity=search.start,
+            uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance, speckle_range=SPECKLE_RANGE,
+            max_speckle_size=self.max_speckle_size, confidence_of=confidence, keep_costs=self.keep_costs,
         )  # fmt: skip
 
 

@@ -29,7 +29,6 @@ from tests.bench.stereo_scores import devon, load_scene, rows_filled
 
 WIDTH, HEIGHT = 1280, 960
 ROUNDS = 9
-COSTS = ("census", "census+gradient")
 
 
 def colour_pair() -> StereoFrame:
@@ -81,16 +80,14 @@ def speed() -> None:
         "OpenCV HH": opencv(cv2.STEREO_SGBM_MODE_HH, 128, frame),
         "OpenCV 3WAY": opencv(cv2.STEREO_SGBM_MODE_SGBM_3WAY, 128, frame),
     }
-    for cost in COSTS:
-        for disparities in (128, 192):
-            for threads in (1, 2):
-                match = Match(cost=cost, disparities=disparities, threads=threads)
-                contestants[f"{cost} {disparities} x{threads}"] = lambda match=match: match(frame)
-            match = Match(cost=cost, disparities=disparities)
-            pool = ThreadPoolExecutor(2)
-            contestants[f"{cost} {disparities}, 2 frames on 2 cores"] = lambda match=match, pool=pool: list(
-                pool.map(match, [frame, frame])
-            )
+    for disparities in (128, 192):
+        for threads in (1, 2):
+            match = Match(disparities=disparities, threads=threads)
+            contestants[f"Match {disparities} x{threads}"] = lambda match=match: match(frame)
+        match, pool = Match(disparities=disparities), ThreadPoolExecutor(2)
+        contestants[f"Match {disparities}, 2 frames on 2 cores"] = lambda match=match, pool=pool: list(
+            pool.map(match, [frame, frame])
+        )
     prior = Match(disparities=192)(frame)
     for threads in (1, 2):
         match = Match(search_radius=4, paths=4, threads=threads)
@@ -100,11 +97,10 @@ def speed() -> None:
     for name, value in seconds.items():
         ratios = f"{value / seconds['OpenCV HH']:6.3f}  {value / seconds['OpenCV 3WAY']:6.3f}"
         print(f"{name:52} {1e3 * value:8.1f} {ratios}")
-    for cost in COSTS:
-        wide, narrow = seconds[f"{cost} 192 x2"], seconds[f"{cost} 128 x2"]
-        alone, both = seconds[f"{cost} 128 x1"], seconds[f"{cost} 128, 2 frames on 2 cores"] / 2
-        print(f"{cost}: 192 disparities over 128 {wide / narrow:.2f}; 2 threads over 1 {narrow / alone:.2f}", end="")
-        print(f" (a frame of two at once over one alone: {both / alone:.2f})")
+    wide, narrow = seconds["Match 192 x2"], seconds["Match 128 x2"]
+    alone, both = seconds["Match 128 x1"], seconds["Match 128, 2 frames on 2 cores"] / 2
+    print(f"192 disparities over 128 {wide / narrow:.2f}; 2 threads over 1 {narrow / alone:.2f}", end="")
+    print(f" (a frame of two at once over one alone: {both / alone:.2f})")
 
 
 MEASURE = """
@@ -112,24 +108,23 @@ import json, re, sys, time
 start = time.perf_counter()
 import numpy as np
 from stages import Match, StereoCamera, StereoFrame
-cost, disparities, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-left, right = np.load(sys.argv[4])
+left, right = np.load(sys.argv[1])
 frame = StereoFrame(0, left, right, StereoCamera(1000, 1000, 640, 480, 0.2, left.shape[1], left.shape[0]))
 peak = lambda: int(re.search(r"VmHWM:\\s+(\\d+)", open("/proc/self/status").read())[1])
 before = peak()
 start = time.perf_counter()
-Match(cost=cost, disparities=disparities, threads=threads)(frame)
+Match(threads=2)(frame)
 first = time.perf_counter() - start
 start = time.perf_counter()
-Match(cost=cost, disparities=disparities, threads=threads)(frame)
+Match(threads=2)(frame)
 after = peak()
 print(json.dumps([first, time.perf_counter() - start, (after - before) / 1024]))
 """
 
 
-def first_call(cost: str, disparities: int, images: Path, cache: Path) -> tuple[float, float, float]:
+def first_call(images: Path, cache: Path) -> tuple[float, float, float]:
     """Seconds of the first call in a new process, of the second, and MB that both added."""
-    command = [sys.executable, "-c", MEASURE, cost, str(disparities), "2", str(images)]
+    command = [sys.executable, "-c", MEASURE, str(images)]
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     output = subprocess.check_output(command, env=environment, stderr=subprocess.DEVNULL)
     first, second, megabytes = json.loads(output)
@@ -141,10 +136,9 @@ def start_up(cache: Path) -> None:
     print(f"\n{'first call in a new process':34} {'cold s':>8} {'warm s':>7} {'next s':>7} {'MB':>6}")
     frame, images = gray_pair(), cache / "pair.npy"  # not made by the process whose memory is measured
     np.save(images, np.stack([frame.left, frame.right]))
-    for cost in COSTS:
-        cold, _, _ = first_call(cost, 192, images, cache / cost)
-        warm, following, megabytes = first_call(cost, 192, images, cache / cost)
-        print(f"{cost + ' 192 x2':34} {cold:8.2f} {warm:7.2f} {following:7.2f} {megabytes:6.0f}")
+    cold, _, _ = first_call(images, cache)
+    warm, following, megabytes = first_call(images, cache)
+    print(f"{'Match 192 x2':34} {cold:8.2f} {warm:7.2f} {following:7.2f} {megabytes:6.0f}")
 
 
 def accuracy(folder: Path) -> None:
@@ -155,8 +149,8 @@ def accuracy(folder: Path) -> None:
         matcher = cv2.StereoSGBM.create(0, levels, 5, 300, 2850, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
         sixteenths = matcher.compute(frame.left[..., ::-1], frame.right[..., ::-1])
         results: dict[str, Array] = {"OpenCV HH": np.where(sixteenths < 0, np.nan, sixteenths / 16).astype(np.float32)}
-        results |= {cost: Match(cost=cost, disparities=levels)(frame).pixels for cost in COSTS}
-        results["census+gradient, rows corrected"] = Match(disparities=levels)(Rectify()(frame)).pixels
+        results["Match"] = Match(disparities=levels)(frame).pixels
+        results["Match, rows corrected"] = Match(disparities=levels)(Rectify()(frame)).pixels
         scored = (mask == 255) & np.isfinite(truth) & (np.arange(truth.shape[1]) >= levels)
         for name, pixels in results.items():
             kept = np.abs(pixels - truth)[scored & np.isfinite(pixels)]
@@ -179,8 +173,8 @@ def fractions() -> None:
     noise = np.random.default_rng(0)
     ways: dict[str, Callable[[StereoFrame], Disparity]] = {
         "OpenCV HH": MatchOpenCV(disparities=64),
-        **{cost: Match(cost=cost, disparities=64) for cost in COSTS},
-        "census+gradient, refined": lambda frame: Refine()(frame, Match(disparities=64)(frame)),
+        "Match": Match(disparities=64),
+        "Match, refined": lambda frame: Refine()(frame, Match(disparities=64)(frame)),
     }
     steps = np.arange(1, 10) / 10
     print(f"\n{'median error, px, of 20 px and':34} {' '.join(f'{step:6.1f}' for step in steps)}")

@@ -31,7 +31,6 @@ from stages.compiled.simd import (
     store,
 )  # fmt: skip
 from stages.data import Array
-from stages.matching.kernels.census import census_costs
 from stages.matching.kernels.sgm_params import SgmParams
 
 ALIGNMENT = 64
@@ -56,14 +55,12 @@ def brightness_steps(image: Array) -> Array:
 
 
 @part
-def aggregate_row(inputs, params, first_lane, costs, paths, y, step, sums, place, total, final, width):
+def aggregate_row(inputs, params, costs, paths, y, step, sums, place, total, final, width):
     """Continue the paths of one sweep from the row before into row y, and add them up.
 
-    first_lane: the disparity of the first lane, less the smallest searched; costs: (W * n,) uint8, C of the row without
-    the prior's costs, with `params.gradient`; else C is the census cost, computed here, which saves writing and reading
-    it; paths: (3 * W * n,) uint8, L of the row before, 0 before the first row, updated; step: 1 for a sweep down, -1
-    for a sweep up; sums: uint8, receives the sums of the row from `place` on (W * n); final: the sums of the other
-    sweep are there, and `total` receives all.
+    costs: (W * n,) uint8, C of the row without the prior's costs; paths: (3 * W * n,) uint8, L of the row before, 0
+    before the first row, updated; step: 1 for a sweep down, -1 for a sweep up; sums: uint8, receives the sums of the
+    row from `place` on (W * n); final: the sums of the other sweep are there, and `total` receives all.
     """
     n = lanes_in(width)
     columns = costs.size // n
@@ -80,15 +77,11 @@ def aggregate_row(inputs, params, first_lane, costs, paths, y, step, sums, place
     store(paths, fall * n, nothing)  # this path begins here, and the other one at the other end of the row
     store(paths, (2 * columns + (last + y) % columns) * n, nothing)
     path = nothing
-    left, right = inputs.left[y], inputs.right[y]
     pulled = inputs.prior.size > 0
     begin = inputs.prior[y if pulled else 0]
     x = first
     for _ in range(columns):
-        if params.gradient:
-            cost = load(costs, x * n, width)
-        else:
-            cost = census_costs(left, right, inputs, params.unseen_cost, x, columns - 1 - x + first_lane, width)
+        cost = load(costs, x * n, width)
         if pulled:
             cost = plus_capped(cost, load(inputs.prior_costs, begin[x], width))
         path = _continued(path, cost, small_step, byte(table, byte(steps, beside)), width)

@@ -1,4 +1,4 @@
-"""Census cost: how many of the 24 comparisons of a pixel with its 5x5 neighbourhood differ between left and right.
+"""Census: how many of the 24 comparisons of a pixel with its 5x5 neighbourhood differ between left and right.
 
 (Zabih and Woodfill, 1994.) Each comparison, "is the neighbour darker", is a bit, so the cost does not depend on
 exposure and gain. The trick is the layout: the bits are 3 planes of bytes, and the right image is mirrored. Then the
@@ -14,7 +14,6 @@ import numpy as np
 from stages.compiled.jit import kernel, part
 from stages.compiled.simd import (
     Width,
-    bit_and,
     bit_or,
     bit_xor,
     broadcast,
@@ -22,7 +21,6 @@ from stages.compiled.simd import (
     count_ones,
     lanes_in,
     load,
-    minus_capped,
     plus,
     store,
     where_less,
@@ -78,39 +76,8 @@ def census_reference(image: Array, mirrored: bool = False) -> Array:
 
 
 @part
-def census_costs(left, right, inputs, unseen_cost, x, i, width):
-    """The costs of pixel x of a row at each disparity.
-
-    left, right: planes of the row in `inputs`; i: the index in `right` of the partner at the first disparity, which the
-    other partners follow; unseen_cost: the cost of partners outside the image.
-    """
-    return in_view_costs(differing_bits(left, right, x, i, width), inputs, unseen_cost, i, width)
-
-
-@part
 def differing_bits(left, right, x, i, width):
-    """The number of comparisons that differ between pixel x and its partners, from index i on."""
+    """The number of comparisons that differ between pixel x of a row and its partners, from index i of `right` on."""
     bits = count_ones(bit_xor(broadcast(byte(left[0], x), width), load(right[0], i, width)))
     bits = plus(bits, count_ones(bit_xor(broadcast(byte(left[1], x), width), load(right[1], i, width))))
     return plus(bits, count_ones(bit_xor(broadcast(byte(left[2], x), width), load(right[2], i, width))))
-
-
-@part
-def in_view_costs(costs, inputs, unseen_cost, i, width):
-    """`costs` of partners from index i on, with `unseen_cost` for those outside the right image."""
-    if inputs.in_view_from <= i < inputs.in_view_to:
-        return costs
-    outside = load(inputs.outside, i, width)
-    return bit_or(minus_capped(costs, outside), bit_and(outside, broadcast(unseen_cost, width)))
-
-
-def census_costs_reference(left: Array, right: Array, lanes: int, minimum: int, unseen_cost: int) -> Array:
-    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 3, W) uint8, not mirrored."""
-    height, _, columns = left.shape
-    costs = np.full((height, columns, lanes), unseen_cost, np.uint8)
-    for x in range(columns):
-        for lane in range(lanes):
-            partner = x - minimum - lane
-            if 0 <= partner < columns:
-                costs[:, x, lane] = np.bitwise_count(left[:, :, x] ^ right[:, :, partner]).sum(axis=1)
-    return costs

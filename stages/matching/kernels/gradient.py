@@ -1,4 +1,4 @@
-"""The default matching cost: census and gradient difference of the pixels, smoothed over 3x3.
+"""The matching cost: census and gradient difference of the pixels, smoothed over 3x3.
 
 raw = 2 * (census bits that differ, 0..24) + 5 * min(|difference of dx| + |difference of dy|, 6)
 Census distinguishes textured patches at any exposure; the truncated gradient difference adds the amount of contrast,
@@ -17,6 +17,8 @@ from stages.compiled.jit import kernel, part
 from stages.compiled.simd import (
     Width,
     average,
+    bit_and,
+    bit_or,
     broadcast,
     byte,
     difference,
@@ -30,7 +32,7 @@ from stages.compiled.simd import (
     store,
 )  # fmt: skip
 from stages.data import Array
-from stages.matching.kernels.census import census_costs_reference, differing_bits, in_view_costs
+from stages.matching.kernels.census import differing_bits
 
 DX, DY = 3, 4  # after the planes of census
 PLANES = 5
@@ -173,14 +175,21 @@ def _moved(lanes, rise):
 
 @part
 def raw_costs(left, right, inputs, unseen_cost, x, i, width):
-    """The costs of pixel x, not smoothed; arguments as in `census_costs`."""
+    """The costs of pixel x of a row at each disparity, not smoothed.
+
+    left, right: planes of the row in `inputs`; i: the index in `right` of the partner at the first disparity, which the
+    other partners follow; unseen_cost: the cost of partners outside the image.
+    """
     bits = differing_bits(left, right, x, i, width)
     dx = difference(broadcast(byte(left[DX], x), width), load(right[DX], i, width))
     dy = difference(broadcast(byte(left[DY], x), width), load(right[DY], i, width))
     step = lesser(plus_capped(dx, dy), broadcast(MAX_GRADIENT_DIFFERENCE, width))
     twice = plus(step, step)
     cost = plus(plus(plus(bits, bits), step), plus(twice, twice))
-    return in_view_costs(cost, inputs, unseen_cost, i, width)
+    if inputs.in_view_from <= i < inputs.in_view_to:
+        return cost
+    outside = load(inputs.outside, i, width)
+    return bit_or(minus_capped(cost, outside), bit_and(outside, broadcast(unseen_cost, width)))
 
 
 def smoothed_costs_reference(
@@ -190,16 +199,15 @@ def smoothed_costs_reference(
 
     left, right: (H, 5, W) uint8, not mirrored; slope: (H, W), of `steep_slope`.
     """
-    bits = census_costs_reference(left[:, :DX], right[:, :DX], lanes, minimum, 0).astype(np.int64)
-    columns = left.shape[2]
-    left, right = left.astype(np.int64), right.astype(np.int64)
-    raw = np.full(bits.shape, unseen_cost)
+    height, _, columns = left.shape
+    raw = np.full((height, columns, lanes), unseen_cost)
     for x in range(columns):
         for lane in range(lanes):
             partner = x - minimum - lane
             if 0 <= partner < columns:
-                step = np.abs(left[:, DX:, x] - right[:, DX:, partner]).sum(axis=1)
-                raw[:, x, lane] = 2 * bits[:, x, lane] + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
+                bits = np.bitwise_count(left[:, :DX, x] ^ right[:, :DX, partner]).sum(axis=1, dtype=np.int64)
+                step = np.abs(left[:, DX:, x].astype(np.int64) - right[:, DX:, partner]).sum(axis=1)
+                raw[:, x, lane] = 2 * bits + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
     wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
     three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
     above, below = three[:-2].copy(), three[2:].copy()

@@ -12,7 +12,7 @@ from stages.compiled.simd import Width
 from stages.data import Array
 from stages.matching.kernels.aggregation import brightness_steps
 from stages.matching.kernels.census import census
-from stages.matching.kernels.gradient import gradients
+from stages.matching.kernels.gradient import PLANES, gradients
 from stages.matching.kernels.sgm_params import SgmParams
 
 NO_PRIOR = np.zeros((1, 0), np.int32), np.zeros(1, np.uint8)
@@ -22,8 +22,8 @@ NO_SLOPE = np.zeros((1, 0), np.int8)
 class MatchingInputs(NamedTuple):
     """Planes of the images for a search with n lanes."""
 
-    left: Array  # (H, planes, >= W) uint8: bits of census, gradients
-    right: Array  # (H, planes, >= W + n) uint8: the same of the right image, backwards from the smallest disparity on
+    left: Array  # (H, 5, >= W) uint8: bits of census, gradients
+    right: Array  # (H, 5, >= W + n) uint8: the same of the right image, backwards from the smallest disparity on
     steps: Array  # of `brightness_steps`
     outside: Array  # (W + n,) uint8: 255 where an element of `right` is outside the image
     in_view_from: int  # elements of `right` from which n and more, of the whole range, are inside
@@ -58,8 +58,7 @@ def _planes(image: Array, params: SgmParams, width: Width | None = None) -> Arra
     if width is not None:
         before, after = max(0, -params.min_disparity), max(0, params.min_disparity)
         image = cv2.copyMakeBorder(cv2.flip(image, 1), 0, 0, before, after + width.lanes, cv2.BORDER_REPLICATE)
-    planes = np.empty((image.shape[0], 5 if params.gradient else 3, -(-image.shape[1] // 64) * 64), np.uint8)
+    planes = np.empty((image.shape[0], PLANES, -(-image.shape[1] // 64) * 64), np.uint8)
     census(image, planes, backwards)
-    if params.gradient:
-        gradients(image, planes, backwards)
+    gradients(image, planes, backwards)
     return planes if after == 0 else np.ascontiguousarray(planes[:, :, after:])

@@ -76,7 +76,7 @@ def match(
         (H, W) uint8.
     prior
         The result of `prior_cost.prior_costs` for the first disparity searched at each pixel, and that of
-        `gradient.steep_slope`, or None.
+        `gradient.steep_slope` where the cost follows slopes, or None.
     search
         The disparities searched at each pixel, or in each band of rows.
     excluded
@@ -124,20 +124,16 @@ def _match_ranges(
 def _sweep(inputs, params, layers, width, scratch, first_lane, top, paths, y, end, step, sums, origin, stride, final):
     """Rows y to end (exclusive) in steps of 1 or -1; the sums of row y are at (y - origin) * stride of `sums`."""
     pixels, evidence, source, costs = layers
-    if params.gradient:
-        for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
-            smoothed_costs(inputs, params.unseen_cost, first_lane, ahead, scratch.column_sums, scratch.costs, width)
+    for ahead in (y - step, y):  # smoothed_costs needs the column sums of two rows before it can begin
+        smoothed_costs(inputs, params.unseen_cost, first_lane, ahead, scratch.column_sums, scratch.costs, width)
     while y != end:
-        if params.gradient:
-            ahead, here = scratch.column_sums[y + step & 1], scratch.column_sums[y & 1]
-            slope = inputs.slope[y if inputs.slope.size > 0 else 0]
-            set_aside(slope, step, ahead, scratch.total, width)
-            smoothed_costs(inputs, params.unseen_cost, first_lane, y + step, scratch.column_sums, scratch.costs, width)
-            follow_slope(slope, step, scratch.total, ahead, here, scratch.costs, width)
-        aggregate_row(
-            inputs, params, first_lane, scratch.costs, paths, y, step, sums, (y - origin) * stride, scratch.total,
-            final, width,
-        )  # fmt: skip
+        ahead, here = scratch.column_sums[y + step & 1], scratch.column_sums[y & 1]
+        slope = inputs.slope[y if inputs.slope.size > 0 else 0]
+        set_aside(slope, step, ahead, scratch.total, width)
+        smoothed_costs(inputs, params.unseen_cost, first_lane, y + step, scratch.column_sums, scratch.costs, width)
+        follow_slope(slope, step, scratch.total, ahead, here, scratch.costs, width)
+        place = (y - origin) * stride
+        aggregate_row(inputs, params, scratch.costs, paths, y, step, sums, place, scratch.total, final, width)
         if final:
             find_winners(
                 scratch.total, scratch.beyond, scratch.guard, step, scratch.winner, scratch.votes, scratch.right, width

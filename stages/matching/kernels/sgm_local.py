@@ -32,7 +32,7 @@ from stages.compiled.simd import (
 from stages.compiled.workspace import Workspace
 from stages.data import Array
 from stages.matching.kernels.aggregation import NOT_SEARCHED, aggregate_reference, next_path
-from stages.matching.kernels.census import PLANES, census_costs
+from stages.matching.kernels.census import PLANES
 from stages.matching.kernels.gradient import MAX_GRADIENT_DIFFERENCE, raw_costs
 from stages.matching.kernels.matching_inputs import MatchingInputs
 from stages.matching.kernels.selection import costs_reference, find_winner, fit_row, keep_costs, select_reference
@@ -143,20 +143,11 @@ def _costs(inputs, params, width, first, costs, span, rows):
     They equal those of the whole range, except that the pixel's own cost stands in for neighbours that were not
     searched at a disparity.
     """
-    if params.gradient:
-        rows[:] = NOT_SEARCHED
-        for y in range(span[0] - 1, span[1] + 1):  # a mean needs the rows before and after
-            _sum_columns(inputs, params, first, min(max(y, 0), first.shape[0] - 1), rows[3], rows[y % 3], width)
-            if y > span[0]:
-                _smooth(inputs, first, y - 1, rows, costs[y - 1], width)
-    else:
-        n, columns = lanes_in(width), first.shape[1]
-        for y in range(span[0], span[1]):
-            left, right, row = inputs.left[y], inputs.right[y], costs[y]
-            for x in range(columns):
-                partners = columns - 1 - x + first[y, x]
-                cost = census_costs(left, right, inputs, params.unseen_cost, x, partners, width)
-                store(row, x * n, plus_capped(cost, load(inputs.prior_costs, inputs.prior[y, x], width)))
+    rows[:] = NOT_SEARCHED
+    for y in range(span[0] - 1, span[1] + 1):  # a mean needs the rows before and after
+        _sum_columns(inputs, params, first, min(max(y, 0), first.shape[0] - 1), rows[3], rows[y % 3], width)
+        if y > span[0]:
+            _smooth(inputs, first, y - 1, rows, costs[y - 1], width)
 
 
 @part
@@ -292,8 +283,7 @@ def match_windows_reference(inputs: MatchingInputs, params: SgmParams, windows: 
     np.put_along_axis(searched, lanes, True, axis=2)
     costs = np.full(searched.shape, NOT_SEARCHED)
     np.put_along_axis(costs, lanes, _raw_costs_reference(inputs, params, first, n), axis=2)
-    if params.gradient:
-        costs = _smoothed_reference(costs, searched, inputs.slope)
+    costs = _smoothed_reference(costs, searched, inputs.slope)
     pull = inputs.prior_costs[inputs.prior[..., np.newaxis] + np.arange(n)]
     np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
     sums = sum(aggregate_reference(inputs.steps, params, costs, searched, sign) for sign in (1, -1))
@@ -309,11 +299,10 @@ def _raw_costs_reference(inputs: MatchingInputs, params: SgmParams, first: Array
     partner = columns - 1 - np.arange(columns)[:, np.newaxis] + first[..., np.newaxis] + np.arange(n)
     left = inputs.left[:, :, :columns].transpose(1, 0, 2)[..., np.newaxis]
     right = inputs.right.transpose(1, 0, 2)[:, np.arange(height)[:, np.newaxis, np.newaxis], partner]
-    costs = np.bitwise_count(left[:PLANES] ^ right[:PLANES]).sum(axis=0, dtype=np.int64)
-    if params.gradient:
-        step = np.abs(left[PLANES:].astype(int) - right[PLANES:]).sum(axis=0)
-        costs = 2 * costs + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
-    return np.where(inputs.outside[partner] > 0, params.unseen_cost, costs)
+    bits = np.bitwise_count(left[:PLANES] ^ right[:PLANES]).sum(axis=0, dtype=np.int64)
+    step = np.abs(left[PLANES:].astype(int) - right[PLANES:]).sum(axis=0)
+    raw = 2 * bits + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
+    return np.where(inputs.outside[partner] > 0, params.unseen_cost, raw)
 
 
 def _smoothed_reference(raw: Array, searched: Array, slope: Array) -> Array:

@@ -10,7 +10,6 @@ from stages.data import Array
 class SgmParams(NamedTuple):
     """The parameters of one search; `stages.Match` documents their meaning."""
 
-    gradient: bool  # census and gradient, or census alone
     diagonals: bool  # 8 paths, or 4
     p1: int
     p2_table: Array  # (256,) uint8, p2 for each step of brightness

@@ -6,8 +6,7 @@ from numba import njit
 
 from stages.compiled.simd import Width
 from stages.matching.kernels.aggregation import aggregate_reference, aggregate_row, brightness_steps
-from stages.matching.kernels.census import census_costs_reference, census_reference
-from stages.matching.kernels.matching_inputs import NO_PRIOR, MatchingInputs, matching_inputs
+from stages.matching.kernels.matching_inputs import NO_PRIOR, MatchingInputs
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
 from tests.conftest import slow
 from tests.stages.matching.pairs import textured
@@ -19,7 +18,7 @@ def sweep(costs, inputs, params, paths, step, sums, total, final, width):
     height, size = costs.shape
     for i in range(height):
         y = i if step > 0 else height - 1 - i
-        aggregate_row(inputs, params, 0, costs[y], paths, y, step, sums, y * size, total[y], final, width)
+        aggregate_row(inputs, params, costs[y], paths, y, step, sums, y * size, total[y], final, width)
 
 
 @pytest.mark.parametrize("lanes", [96, *slow(16, 192)])
@@ -39,7 +38,7 @@ def test_sums_are_those_of_the_reference(lanes, paths, height, columns, pull):
         expected = np.minimum(costs.astype(int) + prior_costs_reference(near, 0, lanes, *pull), 255).astype(np.uint8)
     planes = np.zeros((height, 3, columns), np.uint8)
     inputs = MatchingInputs(planes, planes, brightness_steps(image), np.zeros(1, np.uint8), 0, columns, *prior)
-    params = params_of(True, lanes, 0)._replace(p1=9, diagonals=paths == 8, p2_table=table)
+    params = params_of(lanes, 0)._replace(p1=9, diagonals=paths == 8, p2_table=table)
     everything = np.ones(costs.shape, bool)
     down, up = (aggregate_reference(inputs.steps, params, expected, everything, sign) for sign in (1, -1))
     size, width = columns * lanes, Width(lanes)
@@ -49,19 +48,6 @@ def test_sums_are_those_of_the_reference(lanes, paths, height, columns, pull):
     assert np.array_equal(sums.reshape(costs.shape), down)
     sweep(flat, inputs, params, np.zeros(3 * size, np.uint8), -1, sums, total, True, width)
     assert np.array_equal(total.reshape(costs.shape), np.minimum(down + up, 255))
-
-
-def test_census_costs_made_on_the_way_are_those_handed_in():
-    left, right = (textured(12, 70, seed).astype(np.uint8) for seed in (1, 2))
-    params, width = params_of(False, 32, 0), Width(32)
-    near = np.where(left > 100, 12.0, np.nan).astype(np.float32)
-    inputs = matching_inputs(left, right, params, width, prior_costs(near, 0, 32, 0.5, 4.0))
-    costs = census_costs_reference(census_reference(left), census_reference(right), 32, 0, params.unseen_cost)
-    flat = costs.reshape(12, -1)
-    made, handed = np.empty((2, flat.size), np.uint8)
-    sweep(flat * 0, inputs, params, np.zeros(3 * 70 * 32, np.uint8), 1, made, flat, False, width)
-    sweep(flat, inputs, params_of(True, 32, 0), np.zeros(3 * 70 * 32, np.uint8), 1, handed, flat, False, width)
-    assert np.array_equal(made, handed)
 
 
 def test_brightness_steps_are_differences_to_the_neighbours():

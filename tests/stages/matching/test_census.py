@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from stages.compiled.simd import Width, lanes_in, store
-from stages.matching.kernels.census import census, census_costs, census_costs_reference, census_reference
+from stages.compiled.simd import Width
+from stages.matching.kernels.census import census, census_reference
 from stages.matching.kernels.gradient import (
     follow_slope,
     gradients,
@@ -23,16 +23,6 @@ from tests.stages.matching.pairs import textured
 
 
 @njit
-def rows_of_census(inputs, unseen_cost, costs, width):
-    n = lanes_in(width)
-    columns = costs.shape[1] // n
-    for y in range(costs.shape[0]):
-        for x in range(columns):
-            made = census_costs(inputs.left[y], inputs.right[y], inputs, unseen_cost, x, columns - 1 - x, width)
-            store(costs[y], x * n, made)
-
-
-@njit
 def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
     height, spare = costs.shape[0], np.empty(costs.shape[1], np.uint8)
     first = 0 if step > 0 else height - 1
@@ -46,11 +36,13 @@ def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
         follow_slope(slope, step, spare, sums[y + step & 1], sums[y & 1], costs[y], width)
 
 
-def params_of(gradient, disparities, minimum):
+def params_of(disparities, minimum):
     nothing = np.zeros(256, np.uint8)
-    return SgmParams(
-        gradient, True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32), True
-    )
+    return SgmParams(True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32), True)
+
+
+def planes_of(image):
+    return np.concatenate([census_reference(image), gradients_reference(image)], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -84,24 +76,16 @@ def test_census_does_not_feel_exposure(images):
 def test_costs_are_those_of_the_references_at_every_pixel_and_disparity(images, disparities, minimum):
     left, right = images
     lanes = lanes_for(disparities)
-    width, bits = Width(lanes), [census_reference(image) for image in images]
-    planes = [np.concatenate([b, gradients_reference(i)], axis=1) for b, i in zip(bits, images, strict=True)]
-    costs = np.empty((21, 77 * lanes), np.uint8)
-    for gradient in (False, True):
-        params = params_of(gradient, disparities, minimum)
-        inputs = matching_inputs(left, right, params, width)
-        if gradient:
-            random = np.random.default_rng(3).integers(-1, 2, left.shape, np.int8)
-            for slope in (None, np.pad(random, ((0, 0), (0, 3)))):
-                expected = smoothed_costs_reference(*planes, lanes, minimum, params.unseen_cost, slope)
-                sloping = inputs if slope is None else inputs._replace(slope=slope)
-                for step in (1, -1):
-                    costs[:] = 7
-                    rows_smoothed(sloping, params.unseen_cost, costs, np.empty((2, 77 * lanes), np.uint8), step, width)
-                    assert np.array_equal(costs.reshape(expected.shape), expected)
-        else:
-            expected = census_costs_reference(*bits, lanes, minimum, params.unseen_cost)
-            rows_of_census(inputs, params.unseen_cost, costs, width)
+    width, params = Width(lanes), params_of(disparities, minimum)
+    inputs = matching_inputs(left, right, params, width)
+    costs, sums = np.empty((21, 77 * lanes), np.uint8), np.empty((2, 77 * lanes), np.uint8)
+    random = np.random.default_rng(3).integers(-1, 2, left.shape, np.int8)
+    for slope in (None, np.pad(random, ((0, 0), (0, 3)))):
+        expected = smoothed_costs_reference(*map(planes_of, images), lanes, minimum, params.unseen_cost, slope)
+        sloping = inputs if slope is None else inputs._replace(slope=slope)
+        for step in (1, -1):
+            costs[:] = 7
+            rows_smoothed(sloping, params.unseen_cost, costs, sums, step, width)
             assert np.array_equal(costs.reshape(expected.shape), expected)
 
 
@@ -121,9 +105,7 @@ def test_a_prior_that_changes_by_half_a_pixel_to_one_a_row_is_steep(rise, expect
 def test_costs_on_steep_ground_are_lower_where_the_mean_follows_it(rise):
     right = np.concatenate([textured(21, 60, 4), np.zeros((21, 4))], axis=1).astype(np.uint8)
     left = np.stack([np.roll(row, 20 + rise * (y - 10)) for y, row in enumerate(right)])
-    planes = [np.concatenate([census_reference(image), gradients_reference(image)], axis=1) for image in (left, right)]
-    flat, along = (
-        smoothed_costs_reference(*planes, 48, 0, 11, np.full(left.shape, slope)) for slope in (0, rise)
-    )  # fmt: skip
+    planes = planes_of(left), planes_of(right)
+    flat, along = (smoothed_costs_reference(*planes, 48, 0, 11, np.full(left.shape, slope)) for slope in (0, rise))
     y, x = np.mgrid[3:18, 36:60]
     assert along[y, x, 20 + rise * (y - 10)].mean() < flat[y, x, 20 + rise * (y - 10)].mean()

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages.data import Disparity, PixelOrigin, StereoFrame
-from stages.matching.match import COSTS, LEADS, Match
+from stages.matching.match import CONFIDENCES, LEADS, Match
 from stages.matching.match_opencv import MatchOpenCV
 from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.conftest import data_folder
@@ -45,8 +45,7 @@ MATCHERS = Match(disparities=48), MatchOpenCV(disparities=48)
 
 
 @pytest.mark.parametrize(("match", "border", "share", "largest"), [
-    *((Match(disparities=48, cost=cost, paths=paths), 2, share, 0.11)
-      for cost in COSTS for paths, share in ((4, 0.85), (8, 0.95))),
+    *((Match(disparities=48, paths=paths), 2, share, 0.11) for paths, share in ((4, 0.85), (8, 0.95))),
     *((MatchOpenCV(disparities=48, paths=paths, color=color), 0, 0.95, 0.15)
       for color in (False, True) for paths in (3, 5, 8)),
 ])  # fmt: skip
@@ -79,10 +78,9 @@ def test_a_steep_slope_has_fewer_errors_where_the_cost_follows_it(search):
     assert bad(True) < 0.8 * bad(False)
 
 
-@pytest.mark.parametrize("cost", COSTS)
-def test_disparities_are_not_drawn_to_whole_numbers(slope, cost):
+def test_disparities_are_not_drawn_to_whole_numbers(slope):
     frame, truth = slope
-    error = Match(disparities=48, cost=cost)(frame).pixels - truth
+    error = Match(disparities=48)(frame).pixels - truth
     part = (10 * (truth % 1)).astype(int)
     bias = [np.nanmedian(error[(part == i) & (np.abs(error) < 1)]) for i in range(10)]
     assert np.abs(bias).max() < 0.06, bias
@@ -99,7 +97,7 @@ def test_costs_are_kept_if_asked_for_and_change_nothing_else(slope, near):
     assert kept.costs is not None
     assert same(plain, kept)
     lowest, next_lowest = kept.costs.astype(int)
-    lead = np.round(np.interp(plain.confidence, COSTS[match.cost].confidence, LEADS))
+    lead = np.round(np.interp(plain.confidence, CONFIDENCES, LEADS))
     known = plain.confidence > 0
     np.testing.assert_array_equal((next_lowest - lowest)[known], lead[known])
 
@@ -211,12 +209,12 @@ def test_a_uniform_image_has_no_disparity(dtype, level, match):
 
 @given(
     st.integers(16, 90), st.integers(16, 90), st.sampled_from([4, 8]), st.sampled_from([1, 13, 50, 64, 70, 96]),
-    st.integers(-15, 15), st.sampled_from(sorted(COSTS)), st.integers(0, 99),
+    st.integers(-15, 15), st.integers(0, 99),
 )  # fmt: skip
-def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, disparities, minimum, cost, seed):
+def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, disparities, minimum, seed):
     left = textured(h, w, seed).astype(np.uint8)
     right = np.roll(left, -5, axis=1)
-    match = Match(disparities=disparities, min_disparity=minimum, paths=paths, cost=cost)
+    match = Match(disparities=disparities, min_disparity=minimum, paths=paths)
     result = match(frame_of(left, right))
     known = check_in_view(result, minimum, minimum + disparities - 1)
     assert np.isin(result.source[~known], REASONS).all()
@@ -233,11 +231,10 @@ def known(slope):
     return Disparity(0, rough, np.full(truth.shape, PixelOrigin.FILLED, np.uint8), np.ones(truth.shape, np.float32))
 
 
-@pytest.mark.parametrize("cost", COSTS)
 @pytest.mark.parametrize("paths", [4, 8])
-def test_near_a_prior_disparities_are_found_also_beyond_the_range(slope, known, cost, paths):
+def test_near_a_prior_disparities_are_found_also_beyond_the_range(slope, known, paths):
     frame, truth = slope
-    near = Match(disparities=10, search_radius=4, cost=cost, paths=paths, prior_weight=0.0)
+    near = Match(disparities=10, search_radius=4, paths=paths, prior_weight=0.0)
     found = near(frame, known)
     guided = np.isfinite(known.pixels)
     assert np.isnan(found.pixels[~guided]).all()
@@ -257,10 +254,9 @@ def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(slope, 
     assert np.isfinite(pixels)[(truth > 24) & np.isfinite(known.pixels)].mean() > 0.95
 
 
-@pytest.mark.parametrize("cost", COSTS)
-def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope, cost):
+def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope):
     frame, _ = slope
-    match = Match(disparities=48, cost=cost)
+    match = Match(disparities=48)
     alone = match(frame)
     with ThreadPoolExecutor(3) as workers:
         others = list(workers.map(lambda stage: stage(frame), [replace(match, threads=t) for t in (1, 2, 3, 2)]))
@@ -309,10 +305,9 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
         stamp = simulation.stamp(index)
         truth = true_disparity(simulation, stamp, made).pixels
         frame = StereoFrame(stamp, *made.images, simulation.camera)
-        for cost in COSTS:
-            result = Match(disparities=96, cost=cost)(frame)
-            known = np.isfinite(result.pixels) & np.isfinite(truth)
-            parts.append((result.confidence[known], np.abs(result.pixels - truth)[known] <= 1))
+        result = Match(disparities=96)(frame)
+        known = np.isfinite(result.pixels) & np.isfinite(truth)
+        parts.append((result.confidence[known], np.abs(result.pixels - truth)[known] <= 1))
     confidence, right = map(np.concatenate, zip(*parts, strict=True))
     assert len(right) > 200_000
     assert right.mean() == pytest.approx(confidence.mean(), abs=0.05)
@@ -324,10 +319,8 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
     ("parameters", "message"),
     [
         ({"p1": 100, "p2": 30}, "p2 must be above"),
-        ({"p2": 220}, "at most 196 with cost census\\+gradient"),
-        ({"unseen_cost": 25, "cost": "census"}, "unseen_cost must be at most 24 with cost census"),
+        ({"p2": 220}, "p2 must be at most 196"),
         ({"paths": 5}, "must be one of 4, 8"),
-        ({"cost": "sad"}, "must be one of census, census\\+gradient"),
         ({"max_depth": "12m"}, "max_depth must be a number in m, not '12m'"),
     ],
 )
@@ -350,8 +343,6 @@ def test_frames_that_cannot_be_matched_are_refused(slope):
         Match(search_radius=4)(frame)
     with pytest.raises(ValueError, match=r"follow_slopes needs a `prior`"):
         Match(follow_slopes=True)(frame)
-    with pytest.raises(ValueError, match="follow_slopes has no effect with cost census"):
-        Match(follow_slopes=True, cost="census")
     with pytest.raises(ValueError, match=r"prior must be a stages\.Disparity, not a ndarray"):
         Match()(frame, truth)
     with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
@@ -368,7 +359,7 @@ sys.path.insert(0, {root!r})
 from stages import Match
 from tests.stages.matching.pairs import slanted_pair
 frame, _ = slanted_pair(height=64, width=100)
-results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
+results = [Match(disparities=40)(frame)]
 results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
 print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).hexdigest())
 """
@@ -378,7 +369,7 @@ print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).he
 @pytest.mark.parametrize("processor", ["haswell", "nehalem"])
 def test_processors_without_avx512_give_the_same_bits(processor):
     frame, _ = slanted_pair(height=64, width=100)
-    results = [Match(disparities=40, cost=cost)(frame) for cost in ("census", "census+gradient")]
+    results = [Match(disparities=40)(frame)]
     results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
     expected = b"".join(result.pixels.tobytes() for result in results)
     command = [sys.executable, "-c", DIGEST.format(root=str(ROOT))]

@@ -37,7 +37,7 @@ def test_a_row_is_selected_as_by_the_reference_in_either_direction(disparities, 
         total[x, max(0, d - 1) : d + 2] = (4, 2, 3)[: len(total[x, max(0, d - 1) : d + 2])]
     guard = np.where(np.abs(np.arange(2 * lanes) - lanes) <= 1, 255, 0).astype(np.uint8)
     beyond = np.where(np.arange(lanes) < disparities, 0, 255).astype(np.uint8)
-    params = params_of(True, disparities, minimum)._replace(uniqueness=1, lr_tolerance=1)
+    params = params_of(disparities, minimum)._replace(uniqueness=1, lr_tolerance=1)
     expected = select_reference(total[:, :disparities], np.full(columns, minimum), minimum, disparities, params)
     index = np.uint8 if lanes <= 256 else np.uint16
     for step in (1, -1):
