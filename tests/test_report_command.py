@@ -8,7 +8,13 @@ import cv2
 import numpy as np
 
 from recordings.comparison.text import moment
+from recordings.export.png_pages import relief_page
+from recordings.mcap.writer import Ros2Writer
+from recordings.reporting.page import write_report
 from recordings.reporting.run_facts import read_facts
+from recordings.ros2 import to_msg as ros2
+from recordings.sinks.colormaps import elevation_limits
+from stages.data import ElevationMap
 from tests.conftest import SMALL, rewrite, roverflow
 
 VOID = {"meta", "img", "link", "line", "circle", "polyline"}
@@ -60,6 +66,26 @@ def test_a_report_stands_alone_and_shows_maps_frames_and_losses(result, tmp_path
     assert "Template parts/match_pyramid.yaml" in text
     assert "\n# Matches at a quarter" in "\n".join(page.words)
     assert "# #" not in text
+
+
+def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_path):
+    path, drawn = tmp_path / "out.mcap", []
+    with Ros2Writer(path) as writer:
+        writer.metadata("roverflow", {"pipeline": ""})
+        for frame_id, windows in (("odom", 3), ("odom/2", 2)):
+            heights = np.tile(np.linspace(0, windows, 100 * windows, dtype=np.float32), (100, 1))
+            drawn.append(ElevationMap(1, {"elevation": heights}, 0.1, (0.0, 0.0), frame_id))
+            for number, part in enumerate(np.hsplit(heights, windows)):
+                grid = ElevationMap(number, {"elevation": part}, 0.1, (10.0 * number, 0.0), frame_id)
+                writer.write("/nav/regional_map", ros2.grid_map(grid), 10 * len(drawn) + number)
+    write_report(tmp_path / "out.html", [path])
+    images = Page((tmp_path / "out.html").read_text()).images
+    assert [name for name, _ in images] == ["regional elevation map"] * 2
+    for (_, data), whole in zip(images, drawn, strict=True):
+        pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+        page = relief_page(whole, elevation_limits(whole.layers["elevation"]))
+        page = cv2.resize(page, pixels.shape[1::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(page.astype(float) - pixels).mean() < 2
 
 
 def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):

@@ -182,12 +182,16 @@ class MapFiles:
             points = _read(_fields_of, frame[POINTS], result)
             add_colors(self.colors, points, frame["level"], self.elevation.resolution)
 
+    @property
+    def bounds(self) -> Mosaic | None:
+        """The map whose known cells bound both."""
+        return self.elevation or self.navigation
+
     def close(self) -> bool:
         """Whether any cell is known; the maps are cut to those, the navigation map as the elevation map."""
-        bounds = self.elevation or self.navigation
-        if bounds is None or not bounds.close():
+        if self.bounds is None or not self.bounds.close():
             return False
-        return self.navigation is None or self.navigation.close(like=bounds)
+        return self.navigation is None or self.navigation.close(like=self.bounds)
 
     def write(self, folder: Path, time: str) -> list[Path]:
         """GeoTIFFs of each layer and of all, hillshade with its world file, and navigation map with its YAML."""

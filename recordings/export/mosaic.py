@@ -102,6 +102,14 @@ class Mosaic:
         inside[max(0, -row) : max(0, self.shape[0] - row), max(0, -col) : max(0, self.shape[1] - col)] = True
         return np.where(inside & (cells["added"] > 0), cells[layer], self.fills[layer])
 
+    def overview(self, layer: str, max_side: int) -> tuple[Array, float]:
+        """The largest value of each square of cells, at most `max_side` squares a side, and their size, m."""
+        step = -(-max(self.shape) // max_side)
+        rows, cols = (-(-length // step) for length in self.shape)
+        blocks = (self.block(layer, row * step, 0, step, cols * step) for row in range(rows))
+        largest = [np.fmax.reduce(block.reshape(step, cols, step), axis=(0, 2)) for block in blocks]
+        return np.stack(largest), step * self.resolution
+
     def tiles(self) -> Iterator[tuple[tuple[int, int], dict[str, Array]]]:
         """Index of each tile of `TILE_SIDE` cells, counted from the origin of the frame, and its layers."""
         for index, tile in self._cells.tiles.items():

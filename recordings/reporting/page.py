@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
+
+import numpy as np
 
 from flow.contracts import counted
 from recordings.atomic_write import written
 from recordings.comparison.diff import diff
 from recordings.comparison.text import format_diff, moment
-from recordings.export.png_pages import PAGES
-from recordings.reporting.figures import line_plot, picture, track_plot
-from recordings.reporting.run_facts import REGIONAL, RunFacts, read_facts
+from recordings.errors import LogError
+from recordings.export.bundle import MapFiles
+from recordings.export.png_pages import PAGES, relief_page, verdict_page
+from recordings.reporting.figures import MAX_WIDTH, line_plot, picture, track_plot
+from recordings.reporting.run_facts import RunFacts, read_facts
+from recordings.sinks.colormaps import elevation_limits
 from recordings.sinks.overwrite import REPORT
+from stages.data import Array, ElevationMap, NavigationMap
 
 MAX_LOSSES = 100  # rows of the table
+MAX_REGIONS = 6  # frames of reference whose maps are drawn
 STYLE = Path(__file__).with_name("style.css")
 
 
@@ -88,15 +96,33 @@ def _verdict(facts: RunFacts) -> str:
 
 
 def _regional(facts: RunFacts) -> str:
-    """The last regional maps."""
-    pictures = [
-        picture(
-            PAGES[of_frame][1](facts.regional[topic]), f"regional {of_frame.removeprefix('/nav/').replace('_', ' ')}"
-        )
-        for topic, of_frame in REGIONAL.items()
-        if topic in facts.regional
-    ]
-    return f"<div class=pictures>{''.join(pictures)}</div>" if pictures else ""
+    """The regional maps of the whole run: of the largest frames of reference, as visual odometry may begin new ones."""
+    notes, drawn = [], list[tuple[int, MapFiles]]()
+    for maps in facts.regional.values():
+        try:
+            if maps.close() and maps.bounds is not None:
+                drawn.append((math.prod(maps.bounds.shape), maps))
+        except LogError as error:
+            notes.append(f"<p>{escape(str(error))}</p>")
+    drawn.sort(key=lambda found: -found[0])
+    if (more := len(drawn) - MAX_REGIONS) > 0:
+        notes.append(f"<p>{counted(more, 'smaller map')} in other frames of reference.</p>")
+    pages = [page for _, maps in drawn[:MAX_REGIONS] for page in _region_pages(maps)]
+    pictures = [picture(page, f"regional {name} map") for name, page in pages]
+    return "".join([f"<div class=pictures>{''.join(pictures)}</div>" if pictures else "", *notes])
+
+
+def _region_pages(maps: MapFiles) -> Iterator[tuple[str, Array]]:
+    """Name and page of the elevation map and the navigation map."""
+    if (terrain := maps.elevation) is not None:
+        heights, size = terrain.overview("elevation", MAX_WIDTH)
+        grid = ElevationMap(maps.stamp, {"elevation": heights}, size, terrain.origin, terrain.frame_id)
+        yield "elevation", relief_page(grid, elevation_limits(heights))
+    if (navigation := maps.navigation) is not None:
+        cells, size = navigation.overview("cells", MAX_WIDTH)
+        reason = np.zeros(cells.shape, np.uint8)
+        verdicts = NavigationMap(maps.stamp, cells, reason, size, navigation.origin, navigation.frame_id)
+        yield "navigation", verdict_page(verdicts)
 
 
 def _plots(facts: Sequence[RunFacts]) -> str:

@@ -10,15 +10,15 @@ from typing import Any
 
 import numpy as np
 
+from recordings.export.bundle import REGIONAL, MapFiles
+from recordings.export.mosaic import RIM_WIDTH
 from recordings.export.png_pages import PAGES
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
 from recordings.scoring.result_log import check_profile, end_of_run, facts_of
 from stages.data import Cell
 
-# Topic of a regional map -> that of the same map of a frame
-REGIONAL = {"/nav/regional_map": "/nav/elevation_map", "/nav/regional_navigation_map": "/nav/navigation_map"}
-TOPICS = (*PAGES, "/nav/pose", "/nav/diagnostics", *REGIONAL)
+TOPICS = (*PAGES, "/nav/pose", "/nav/diagnostics", *filter(None, REGIONAL))
 
 
 @dataclass
@@ -27,8 +27,8 @@ class RunFacts:
 
     about, counts: facts of the run, and its verdict, counts and findings; unreadable: reason -> number of messages;
     stamps: of the frames, ns; series: name with unit -> stamp -> value; track: (x, y) of the rover, m; losses: (stream,
-    stamp, reason, detail); drawn: name -> stamp and messages by topic, of the frames that are drawn; regional: topic ->
-    last message.
+    stamp, reason, detail); drawn: name -> stamp and messages by topic, of the frames that are drawn; regional: frame of
+    reference -> the regional maps in it.
     """
 
     path: Path
@@ -40,7 +40,7 @@ class RunFacts:
     track: list[tuple[float, float]] = field(default_factory=list)
     losses: list[tuple[str, str, str, str]] = field(default_factory=list)
     drawn: dict[str, tuple[int, dict[str, Any]]] = field(default_factory=dict)
-    regional: dict[str, Any] = field(default_factory=dict)
+    regional: dict[str, MapFiles] = field(default_factory=dict)
 
 
 def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) -> RunFacts:
@@ -85,7 +85,8 @@ def _add(facts: RunFacts, topic: str, stamp: int, message: Any) -> None:
             if "reason" in found:
                 facts.losses.append((found["stream"], found["stamp"], found["reason"], status.message))
     elif topic in REGIONAL:
-        facts.regional[topic] = message
+        maps = facts.regional.setdefault(message.header.frame_id, MapFiles(RIM_WIDTH))
+        maps.add(facts.path, REGIONAL, stamp, {topic: message})
     for name, value in values.items():
         facts.series.setdefault(name, {})[stamp] = value
 

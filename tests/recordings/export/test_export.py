@@ -13,6 +13,7 @@ from PIL import Image
 
 from recordings.errors import LogError
 from recordings.export.bundle import export, file_names
+from recordings.export.mosaic import Mosaic
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
@@ -307,6 +308,18 @@ def test_an_unwritable_file_is_named_and_no_partial_file_is_left(result, tmp_pat
     with pytest.raises(LogError, match=r"cannot write .*variance\.tif: it is a folder"):
         export(result, tmp_path / "out")
     assert not list((tmp_path / "out").glob("*.partial"))
+
+
+def test_an_overview_keeps_the_largest_value_of_each_square_of_cells():
+    mosaic = Mosaic(STEP, "odom", {"cells": np.int8(Cell.UNKNOWN)}, rim=0.0)
+    cells = np.full((5, 7), Cell.FREE, np.int8)
+    cells[3, 5], cells[0, :2], cells[1, :2] = Cell.HAZARD, Cell.UNKNOWN, Cell.UNKNOWN
+    grid = NavigationMap(0, cells, np.zeros(cells.shape, np.uint8), STEP, (0.3, -0.2), "odom")
+    mosaic.add({"cells": cells}, np.ones(cells.shape, bool), grid)
+    assert mosaic.close()
+    overview, size = mosaic.overview("cells", 4)
+    assert (overview.tolist(), size) == ([[-1, 0, 0, 0], [0, 0, 100, 0], [0, 0, 0, 0]], 2 * STEP)
+    assert mosaic.overview("cells", 7)[0].tolist() == cells.tolist()
 
 
 def test_file_names_stay_in_the_folder_and_are_unique():
