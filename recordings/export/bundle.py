@@ -26,7 +26,7 @@ from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import RIM_WIDTH, STRIP_ROWS, Mosaic
 from recordings.export.point_files import CELL_COLOR, add_colors, write_cells, write_points
-from recordings.export.tum import write_tum
+from recordings.export.tum import tum_texts
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.result_log import without_results
@@ -100,7 +100,7 @@ def export(
     else:
         topics = _topics_of(result, maps)
         frames = frames or _is_in_level(result, topics, lost)
-    poses = [] if maps else write_tum(result, out / "poses.tum", lost)
+    poses = [] if maps else _export_poses(result, out, lost)
     if frames:
         return _export_frames(result, out, lost, topics, points=not maps) + poses
     return _export_region(result, out, lost, topics, places) + poses
@@ -211,13 +211,19 @@ class MapFiles:
         return files
 
 
+def _export_poses(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
+    """The poses in each frame of reference; those of two have no distance."""
+    texts = tum_texts(result, lost)
+    folders = _folders(texts)
+    return [_write(out / folders[name] / "poses.tum", Path.write_text, text) for name, text in texts.items()]
+
+
 def _export_region(
     result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics, places: Mapping[str, Georeference]
 ) -> list[Path]:
     """The regional map in `out`; if it was reset, a folder in `out` for each frame of reference."""
     known = regions_of(result, lost, topics)
-    folders = {next(iter(known)): ""} if len(known) == 1 else file_names(known)
-    files = []
+    folders, files = _folders(known), []
     for name, region in known.items():
         region.place = places.get(name)
         files += region.write(out / folders[name], "up to")
@@ -273,6 +279,11 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None, topics: M
 
 def _about(frame_id: str, time: str, stamp: int) -> str:
     return f"roverflow: local frame '{frame_id}', metres, z up; {time} {stamp} ns"
+
+
+def _folders(frames: Collection[str]) -> dict[str, str]:
+    """For each frame of reference its folder; none for a single one."""
+    return dict.fromkeys(frames, "") if len(frames) == 1 else file_names(frames)
 
 
 def file_names(names: Iterable[str]) -> dict[str, str]:

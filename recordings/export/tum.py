@@ -1,4 +1,4 @@
-"""Poses as a TUM file, which evo and others read: stamp in seconds, x y z, and the quaternion x y z w, in a line."""
+"""Poses as TUM files, which evo and others read: stamp in seconds, x y z, and the quaternion x y z w, in a line."""
 
 from __future__ import annotations
 
@@ -10,19 +10,16 @@ from recordings.mcap.file import iter_decoded
 POSE = "/nav/pose"
 
 
-def write_tum(result: Path, path: Path, lost: Counter[str] | None = None) -> list[Path]:
-    """Write the poses of a result log; returns the file, or nothing if the log has no poses.
+def tum_texts(result: Path, lost: Counter[str] | None = None) -> dict[str, str]:
+    """Frame of reference -> the poses of a result log in it, as the text of a TUM file.
 
     lost: counts the reasons of losses in a damaged log, which is otherwise refused.
     """
-    lines = []
+    lines = dict[str, list[str]]()
     for _, stamp, message in iter_decoded(result, [POSE], lost):
         place, turn = message.pose.pose.position, message.pose.pose.orientation
         numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
         seconds = f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}"
-        lines.append(f"{seconds} {' '.join(f'{number:.9g}' for number in numbers)}\n")
-    if not lines:
-        return []
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("".join(lines))
-    return [path]
+        line = f"{seconds} {' '.join(f'{number:.9g}' for number in numbers)}\n"
+        lines.setdefault(message.header.frame_id, []).append(line)
+    return {frame_id: "".join(own) for frame_id, own in lines.items()}

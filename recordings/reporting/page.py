@@ -137,8 +137,9 @@ def _plots(facts: Sequence[RunFacts]) -> str:
             for label, values in zip(labels, series, strict=True)
         }
         plots.append(line_plot(name, curves))
-    tracks = {found.path.name: found.track for found in facts}
-    plots.append(track_plot("way driven, x to the right, y up, m", tracks))
+    for frame_id in dict.fromkeys(frame_id for found in facts for frame_id in found.tracks):
+        tracks = {found.path.name: found.tracks.get(frame_id, []) for found in facts}
+        plots.append(track_plot(f"way driven in {frame_id}, x to the right, y up, m", tracks))
     return f"<div class=pictures>{''.join(plots)}</div>"
 
 

@@ -26,9 +26,9 @@ class RunFacts:
     """A result log in figures.
 
     about, counts: facts of the run, and its verdict, counts and findings; unreadable: reason -> number of messages;
-    stamps: of the frames, ns; series: name with unit -> stamp -> value; track: (x, y) of the rover, m; losses: (stream,
-    stamp, reason, detail); drawn: name -> stamp and messages by topic, of the frames that are drawn; regional: frame of
-    reference -> the regional maps in it.
+    stamps: of the frames, ns; series: name with unit -> stamp -> value; tracks: frame of reference -> (x, y) of the
+    rover, m; losses: (stream, stamp, reason, detail); drawn: name -> stamp and messages by topic, of the frames that
+    are drawn; regional: frame of reference -> the regional maps in it.
     """
 
     path: Path
@@ -37,7 +37,7 @@ class RunFacts:
     unreadable: Counter[str] = field(default_factory=Counter)
     stamps: list[int] = field(default_factory=list)
     series: dict[str, dict[int, float]] = field(default_factory=dict)
-    track: list[tuple[float, float]] = field(default_factory=list)
+    tracks: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     losses: list[tuple[str, str, str, str]] = field(default_factory=list)
     drawn: dict[str, tuple[int, dict[str, Any]]] = field(default_factory=dict)
     regional: dict[str, MapFiles] = field(default_factory=dict)
@@ -78,7 +78,7 @@ def _add(facts: RunFacts, topic: str, stamp: int, message: Any) -> None:
         values["hazard cells"] = float(np.sum(cells == Cell.HAZARD))
     elif topic == "/nav/pose":
         place = message.pose.pose.position
-        facts.track.append((place.x, place.y))
+        facts.tracks.setdefault(message.header.frame_id, []).append((place.x, place.y))
     elif topic == "/nav/diagnostics":
         for status in message.status:
             found = {pair.key: pair.value for pair in status.values}

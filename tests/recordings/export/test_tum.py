@@ -11,7 +11,12 @@ from evo.tools.file_interface import read_bag_trajectory, read_tum_trajectory_fi
 from rosbags.rosbag2 import Reader
 from scipy.spatial.transform import Rotation
 
+from recordings.export.bundle import export
 from recordings.mcap.file import iter_decoded
+from recordings.mcap.writer import Ros2Writer
+from recordings.reporting.page import write_report
+from recordings.ros2 import to_msg as ros2
+from stages.data import ElevationMap, Pose
 from tests.conftest import SMALL, roverflow
 
 
@@ -42,6 +47,25 @@ def test_evo_agrees_with_score_on_the_pose_error(traverse, tmp_path):
     scored = json.loads((tmp_path / "score.json").read_text())["pose"]
     assert ape.get_statistic(StatisticsType.max) == pytest.approx(scored["max_error"], rel=1e-6)
     assert scored["max_error"] > 1e-3
+
+
+def test_poses_in_another_frame_of_reference_are_no_motion(tmp_path):
+    path, frames = tmp_path / "out.mcap", ("visual_odom", "visual_odom/2")
+    with Ros2Writer(path) as writer:
+        writer.metadata("roverflow", {"pipeline": ""})
+        for stamp in range(6):
+            frame_id, place = frames[stamp // 3], np.array([100.0 * (stamp // 3) + 0.1 * stamp, 0.0, 0.0])
+            pose = Pose(stamp, place, np.array([0.0, 0, 0, 1]), frame_id, "base_link", None)
+            writer.write("/nav/pose", ros2.odometry(pose), stamp)
+            terrain = ElevationMap(stamp, {"elevation": np.zeros((3, 3), np.float32)}, 0.1, (0.0, 0.0), frame_id)
+            writer.write("/nav/regional_map", ros2.grid_map(terrain), stamp)
+    export(path, tmp_path)
+    for folder in ("visual_odom", "visual_odom-2"):
+        trajectory = read_tum_trajectory_file(str(tmp_path / folder / "poses.tum"))
+        assert trajectory.path_length == pytest.approx(0.2)
+    write_report(tmp_path / "out.html", [path])
+    page = (tmp_path / "out.html").read_text()
+    assert [page.count(f"way driven in {frame_id}, ") for frame_id in frames] == [1, 1]
 
 
 def heading(trajectory):
