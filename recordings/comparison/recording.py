@@ -36,7 +36,7 @@ class DiffRecording:
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
-        self.left_out = 0
+        self.left_out = set[int]()  # stamps
         self.errors: Sequence[tuple[str, int, bytes]] = ()  # variant, stamp and page of errors against the truth
         self._names = dict[str, str]()
         self._drawing: list[tuple[str, int, Future[tuple[bytes, ...]]]] = []
@@ -59,7 +59,7 @@ class DiffRecording:
             return
         if change.stamp not in self.stamps:
             if len(self.stamps) == MAX_FRAMES:
-                self.left_out += 1
+                self.left_out.add(change.stamp)
                 return
             self.stamps.append(change.stamp)
         self._drawing.append((prefix + change.topic, change.stamp, self._threads.submit(_drawn, change)))

@@ -49,11 +49,11 @@ class Sweep:
 
 
 def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Array:
-    """A bar for each value of a setting and a line for A, as an RGB picture; figures: of A, B, C, ..."""
+    """A bar for each value of a setting and a line for A, as an RGB picture; figures: of A, B, ...; NaN = unknown."""
     page = np.full((HEIGHT, WIDTH, 3), PAPER, np.uint8)
-    known = np.nan_to_num(np.array(figures, float))
-    step = round_step(float(known.max()) / 2)
-    top, bottom, wide = step * max(1, np.ceil(known.max() / step)), HEIGHT - BOTTOM, (WIDTH - LEFT - 70) / len(values)
+    largest = float(np.nanmax(figures))
+    step = round_step(largest / 2)
+    top, bottom, wide = step * max(1, np.ceil(largest / step)), HEIGHT - BOTTOM, (WIDTH - LEFT - 70) / len(values)
 
     def row(figure: float) -> int:
         return int(bottom - figure / top * (bottom - TOP) + 0.5)
@@ -62,13 +62,17 @@ def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Arra
         cv2.line(page, (LEFT, row(figure)), (WIDTH - 70, row(figure)), (214, 214, 210), 2)
         _text(page, f"{round(figure, 9):,.6g}", (LEFT - 14, row(figure) + 12), 1.0)
     widest = max(_width(value) for value in values)
-    for number, (value, figure) in enumerate(zip(values, known[1:], strict=True)):
+    for number, (value, figure) in enumerate(zip(values, figures[1:], strict=True)):
         left, right = (round(LEFT + (number + share) * wide) for share in (0.2, 0.8))
-        cv2.rectangle(page, (left, row(figure)), (right, bottom), VARIANT_RGB, cv2.FILLED)
+        if np.isnan(figure):
+            _text(page, "unknown" if _width("unknown") < wide else "?", ((left + right) // 2, bottom - 14), 0.5)
+        else:
+            cv2.rectangle(page, (left, row(figure)), (right, bottom), VARIANT_RGB, cv2.FILLED)
         if number % int(np.ceil((widest + 24) / wide)) == 0:
             _text(page, value, ((left + right) // 2, bottom + 42), 0.5)
-    cv2.line(page, (LEFT, row(known[0])), (WIDTH - 70, row(known[0])), A_RGB, 5)
-    _text(page, "A", (WIDTH - 58, row(known[0]) + 12), 0.0)
+    if not np.isnan(figures[0]):
+        cv2.line(page, (LEFT, row(figures[0])), (WIDTH - 70, row(figures[0])), A_RGB, 5)
+        _text(page, "A", (WIDTH - 58, row(figures[0]) + 12), 0.0)
     _text(page, setting, (LEFT + (WIDTH - LEFT - 70) // 2, HEIGHT - 14), 0.5)
     return page
 

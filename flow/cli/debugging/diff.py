@@ -9,6 +9,7 @@ from pathlib import Path
 
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
+from flow.contracts import counted
 from flow.errors import COMPLETE, DIFFERENT
 
 HELP = "compare two result logs: the first difference, and how large the differences are"
@@ -37,6 +38,7 @@ def run(options: argparse.Namespace) -> int:
     elif options.out:
         recording.write(options.out, f"{options.one.name} and {options.other.name}", markdown(found))
         if not options.json:
-            more = f"; {recording.left_out} later differences are not drawn" if recording.left_out else ""
+            left_out = counted(len(recording.left_out), "later frame")
+            more = f"; differences of {left_out} are not drawn" if recording.left_out else ""
             say(f"wrote {options.out} ({options.out.stat().st_size / 1e6:.1f} MB{more})")
     return COMPLETE if found.equal else DIFFERENT

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from recordings.comparison.sweep import A_RGB, TOP, VARIANT_RGB, chart
+from recordings.comparison.sweep import A_RGB, BOTTOM, LEFT, TOP, VARIANT_RGB, chart
 
 
 def spans(mask):
@@ -26,6 +26,13 @@ def test_the_bars_are_as_high_as_the_figures_and_a_is_a_line(scale):
     floor = np.flatnonzero(bars.any(1)).max()
     assert floor - line.mean() == pytest.approx(heights[1] / 2, abs=4)
     assert TOP - 1 <= np.flatnonzero(bars.any(1)).min() < 150
+
+
+def test_an_unknown_figure_has_no_bar_but_says_so():
+    unknown, zero = (chart("disparities", ["1", "2"], [np.nan, figure, 4.0]) for figure in (np.nan, 0.0))
+    assert len(spans((unknown == VARIANT_RGB).all(2).any(0))) == 1
+    assert not (unknown == A_RGB).all(2).any()
+    assert (unknown[:-BOTTOM, LEFT:] < 100).all(2).sum() > (zero[:-BOTTOM, LEFT:] < 100).all(2).sum() + 100
 
 
 def test_values_that_would_overlap_are_left_out():
