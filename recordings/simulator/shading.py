@@ -64,15 +64,14 @@ def _normal_at(scn: Any, surface: int, facet: int, x: float, y: float, z: float)
 
 @borrowing_kernel
 def shade_rows(
-    scn: Any, texture: Any, clear: Any, sun: Any, skylight: float, origin: Any, rotation: Any, fx: float, fy: float,
+    scn: Any, texture: Any, sun: Any, skylight: float, origin: Any, rotation: Any, fx: float, fy: float,
     cx: float, cy: float, first: int, depth: Any, surface: Any, facet: Any, radiance: Any, kind: Any,
 ) -> None:  # fmt: skip
     """Light at the pixels of `cast_rows` (same arguments): radiance (rows, W, 3) float32, about 0 to 1.
 
-    sun: (3,) towards it; clear: its `sunlight.lit_above`; skylight: light of the whole sky, which fills shadows; kind:
-    (rows, W) uint8, the `TerrainClass` of each pixel.
+    sun: (3,) towards it; skylight: light of the whole sky, which fills shadows; kind: (rows, W) uint8, the
+    `TerrainClass` of each pixel.
     """
-    mask = clear.shape[0] - 1
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
         for column in range(depth.shape[1]):
@@ -106,8 +105,7 @@ def shade_rows(
             if toward > 0:
                 lift = 0.001 + 1e-4 * t
                 x, y, z = x + lift * nx, y + lift * ny, z + lift * nz
-                sure = z > clear[floor(y / scn.resolution) & mask, floor(x / scn.resolution) & mask]
-                if sure or first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY:
+                if first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY:
                     # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
                     light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
             light += skylight * (0.5 + 0.5 * nz) * (1 + 0.4 * (grit - 1))

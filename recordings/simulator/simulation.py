@@ -16,7 +16,7 @@ import numpy as np
 
 from flow.parameters import check_parameters, parameter
 from recordings.simulator import camera as cameras
-from recordings.simulator import inertial, raycast, shading, sunlight, texture, traverse
+from recordings.simulator import inertial, raycast, shading, texture, traverse
 from recordings.simulator.odometry import dead_reckoning
 from recordings.simulator.scenes import DEFAULT_SCENE, SCENES, defaults_of
 from recordings.simulator.terrain import Terrain, make_terrain
@@ -200,11 +200,6 @@ class Simulation:
         return np.array([flat * np.cos(self.sun_azimuth), flat * np.sin(self.sun_azimuth), np.sin(self.sun_elevation)])
 
     @cached_property
-    def lit_above(self) -> Array:
-        """The elevation, m, above which each ground cell is certainly lit."""
-        return sunlight.lit_above(self.terrain.scene, self.sun)
-
-    @cached_property
     def texture(self) -> texture.Texture:
         """The look of the ground under this sun."""
         cover = texture.Cover(
@@ -329,7 +324,7 @@ class Simulation:
             hits = depth[rows], surface[rows], facet[rows]
             raycast.cast_rows(self.terrain.scene, *view, self.horizon, rows.start, *hits)
             shading.shade_rows(
-                self.terrain.scene, self.texture, self.lit_above, self.sun, self.skylight, *view, rows.start, *hits,
+                self.terrain.scene, self.texture, self.sun, self.skylight, *view, rows.start, *hits,
                 radiance[rows], kind[rows],
             )  # fmt: skip
 

@@ -199,25 +199,6 @@ def test_the_ground_repeats_without_end():
         assert there[0] == pytest.approx(here[0], abs=1e-4)
 
 
-@pytest.mark.parametrize(("elevation", "azimuth"), [(38, 140), (20, -100), (9, 45), (55, 0), (30, 270), (90, 0)])
-def test_certainly_lit_points_have_a_free_ray_to_the_sun(elevation, azimuth):
-    here = replace(
-        SMALL, slope=float(np.radians(12)), sun_elevation=float(np.radians(elevation)),
-        sun_azimuth=float(np.radians(azimuth)),
-    )  # fmt: skip
-    rng = np.random.default_rng(1)
-    x, y = rng.uniform(-here.terrain.extent, here.terrain.extent, (2, 3000))
-    z = here.terrain.elevation(x, y) + 1e-3
-    row, column = (np.floor(place / here.relief_resolution).astype(int) % here.relief_cells for place in (y, x))
-    sure = z > here.lit_above[row, column]
-    lit = [
-        raycast.first_hit(here.terrain.scene, *point, *here.sun, 0.0, 200.0)[1] == raycast.SKY
-        for point in zip(x, y, z, strict=True)
-    ]
-    assert np.all(np.asarray(lit)[sure])
-    assert sure.sum() > 0.25 * np.sum(lit)
-
-
 def test_no_ray_hits_before_the_clear_depth_of_its_span():
     scene, camera = SMALL.terrain.scene, SMALL.camera
     pose = SMALL.base_at(SMALL.begin).after(SMALL.mounts[0])
