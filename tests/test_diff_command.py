@@ -1,7 +1,6 @@
 """`roverflow diff`: two results side by side."""
 
 import json
-import re
 
 import pytest
 
@@ -70,11 +69,10 @@ def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_resul
     assert f"log_digest: A {one} | B {other}\n" in said(3, "diff", fast_result, out).out
 
 
-def test_copied_inputs_are_counted_and_not_compared(traverse, fast_result, tmp_path, said):
+def test_copied_inputs_are_not_compared(traverse, fast_result, tmp_path, said):
     out = tmp_path / "out.mcap"
     assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
-    equal = said(0, "diff", out, fast_result).out
-    assert re.search(r"^equal: all .*\n\d+ topics of the input copied in A only$", equal, re.M)
+    assert "equal: all " in said(0, "diff", out, fast_result).out
 
 
 def test_a_log_without_results_is_refused(traverse, fast_result, tmp_path, refused):

@@ -18,8 +18,6 @@ from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import decoder_for
 from recordings.scoring.result_log import check_profile, facts_of
 
-_LATE = ("/tf", "/nav/diagnostics")  # they follow from the streams, so they are never the first to differ
-
 
 class MessageDifference(NamedTuple):
     """One topic at one stamp. one, other: the messages, None where a result has none; values: how much they differ."""
@@ -78,8 +76,6 @@ class Diff:
         Topic -> `TopicDiff`, in the order of the pipeline.
     begin : int
         Log time of the first message of the first result, ns.
-    copied : dict
-        "A" and "B" -> topics of the input that only this result has a copy of; copies are not compared.
     facts : dict
         Fact of the run -> its values in both results, where these differ. The pipelines are a unified diff.
     """
@@ -87,19 +83,18 @@ class Diff:
     first: tuple[str, int] | None = None
     topics: dict[str, TopicDiff] = field(default_factory=dict)
     begin: int = 0
-    copied: dict[str, list[str]] = field(default_factory=dict)
     facts: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
     def equal(self) -> bool:
-        """Whether both results have the same messages, byte by byte."""
+        """Whether both results have the same messages under /nav, byte by byte."""
         return self.first is None
 
 
 def diff(
     one: Path | str, other: Path | str, on_change: Callable[[MessageDifference], None] = lambda change: None
 ) -> Diff:
-    """Compare two result logs.
+    """Compare the results, all topics under /nav, of two result logs. Their transforms follow from these.
 
     Parameters
     ----------
@@ -132,12 +127,7 @@ def diff(
     with McapFile(one) as first, McapFile(other) as second:
         found.begin = first.start
         readers = _Reader(first), _Reader(second)
-        copies = [reader.copied for reader in readers]
-        found.copied = {"A": sorted(copies[0] - copies[1]), "B": sorted(copies[1] - copies[0])}
-        topics = {topic for reader in readers for topic in reader.topics}
-        if bool(copies[0]) != bool(copies[1]):
-            topics -= {"/tf", "/tf_static"}  # beside inputs the tree is another one; it follows from the streams
-        rank = _rank_of(about[one]["pipeline"], topics)
+        rank = _rank_of(about[one]["pipeline"], {topic for reader in readers for topic in reader.topics.values()})
         found.topics = {topic: TopicDiff() for topic in sorted(rank, key=lambda topic: rank[topic])}
         for change in _changes(*readers, found.topics):
             found.topics[change.topic].add(change)
@@ -147,26 +137,21 @@ def diff(
 
 
 class _Reader:
-    """Reads the results of a log by groups of one stamp.
-
-    topics: of the results; copied: of the inputs that `run --with-inputs` copied, in the channels after the results'.
-    """
+    """Reads the results of a log by groups of one stamp. topics: of the results, by the numbers of their channels."""
 
     def __init__(self, log: McapFile) -> None:
         self.log = log
-        last = max((number for number, channel in log.channels.items() if channel.topic.startswith("/nav/")), default=0)
-        self._own = {number for number in log.channels if number <= last}
-        self.topics = {log.channels[number].topic for number in self._own}
-        self.copied = {channel.topic for number, channel in log.channels.items() if number > last}
+        channels = log.channels.items()
+        self.topics = {number: channel.topic for number, channel in channels if channel.topic.startswith("/nav/")}
 
     def groups(self) -> Iterator[tuple[int, dict[str, tuple[int, bytes]]]]:
         """(Stamp, topic -> number of its channel and bytes)."""
-        for stamp, group in groupby(self.log.messages(self._own), key=lambda raw: raw.log_time):
+        for stamp, group in groupby(self.log.messages(set(self.topics)), key=lambda raw: raw.log_time):
             messages = dict[str, tuple[int, bytes]]()
             for raw in group:
                 if isinstance(raw, LostMessage):
                     raise LogError(f"{self.log.path}: {raw.reason}; run the pipeline again")
-                messages[self.log.channels[raw.channel].topic] = (raw.channel, bytes(raw.data))
+                messages[self.topics[raw.channel]] = (raw.channel, bytes(raw.data))
             yield stamp, messages
 
     def schema(self, number: int) -> str:
@@ -221,7 +206,7 @@ def _rank_of(pipeline: str, topics: set[str]) -> dict[str, tuple[int, str]]:
 
     def rank(topic: str) -> tuple[int, str]:
         stream = topic.removeprefix("/nav/").partition("/")[0]
-        return (len(order) + 1 + _LATE.index(topic) if topic in _LATE else order.get(stream, len(order))), topic
+        return order.get(stream, len(order)), topic
 
     return {topic: rank(topic) for topic in topics}
 

@@ -120,28 +120,10 @@ def _codes(one: Any, other: Any) -> Measures:
 
 
 def _poses(one: Any, other: Any) -> Measures:
-    return _moved(*((each.pose.pose.position, each.pose.pose.orientation) for each in (one, other)))
-
-
-def _transforms(one: Any, other: Any) -> Measures:
-    first, second = (
-        {(item.header.frame_id, item.child_frame_id): item.transform for item in message.transforms}
-        for message in (one, other)
-    )
-    found = {f"transforms only in {name}": float(len(own.keys() - them.keys()))
-             for name, own, them in (("A", first, second), ("B", second, first))}  # fmt: skip
-    for frames in first.keys() & second.keys():
-        moved = _moved(*((each.translation, each.rotation) for each in (first[frames], second[frames])))
-        found |= {name: max(value, found.get(name, 0.0)) for name, value in moved.items()}
-    return found
-
-
-def _moved(one: tuple[Any, Any], other: tuple[Any, Any]) -> Measures:
-    """How far apart two places are, each a position and a quaternion."""
-    places = [np.array([at.x, at.y, at.z]) for at, _ in (one, other)]
-    turn, to = (np.array([q.x, q.y, q.z, q.w]) for _, q in (one, other))
-    near, far = sorted([np.linalg.norm(turn - to), np.linalg.norm(turn + to)])  # q and -q are the same turn
-    distance = float(np.linalg.norm(places[1] - places[0]))
+    at, to = (np.array([place.x, place.y, place.z]) for place in (one.pose.pose.position, other.pose.pose.position))
+    turn, back = (np.array([q.x, q.y, q.z, q.w]) for q in (one.pose.pose.orientation, other.pose.pose.orientation))
+    near, far = sorted([np.linalg.norm(turn - back), np.linalg.norm(turn + back)])  # q and -q are the same turn
+    distance = float(np.linalg.norm(to - at))
     return {"largest position mm": 1e3 * distance, "largest angle deg": float(np.degrees(4 * np.arctan2(near, far)))}
 
 
@@ -176,5 +158,4 @@ _MEASURES: Mapping[str, Callable[[Any, Any], Measures]] = {
     "sensor_msgs/msg/Image": _codes,
     "nav_msgs/msg/Odometry": _poses,
     "sensor_msgs/msg/PointCloud2": _points,
-    "tf2_msgs/msg/TFMessage": _transforms,
 }

@@ -31,13 +31,12 @@ def comparison(found: Diff) -> str:
     """The topics that differ, for a terminal."""
     if found.first is None:
         messages = sum(topic.messages for topic in found.topics.values())
-        equal = f"equal: all {counted(messages, 'message')} of {counted(len(found.topics), 'topic')}"
-        return "\n".join([equal, *_copies(found)])
+        return f"equal: all {counted(messages, 'message')} of {counted(len(found.topics), 'topic')}"
     topic, stamp = found.first
     lines = [f"the results first differ at {topic}, {moment(stamp)}"]
     lines += [f"  {name}: {_line(item)}" for name, item in found.topics.items() if item.first is not None]
     same = [name for name, item in found.topics.items() if item.first is None]
-    return "\n".join([*lines, *([f"equal: {', '.join(same)}"] if same else []), *_copies(found)])
+    return "\n".join([*lines, *([f"equal: {', '.join(same)}"] if same else [])])
 
 
 def markdown(found: Diff) -> str:
@@ -66,15 +65,6 @@ def _singular(measure: str) -> str:
     """The name of a measure for one thing: "pixel known only in A"."""
     noun, space, rest = measure.partition(" ")
     return noun.removesuffix("s") + space + rest
-
-
-def _copies(found: Diff) -> list[str]:
-    """The copied inputs that only one result has."""
-    return [
-        f"{counted(len(topics), 'topic')} of the input copied in {name} only"
-        for name, topics in found.copied.items()
-        if topics
-    ]
 
 
 def _shown(one: str, other: str) -> str:

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.comparison.measures import measures
-from recordings.ros2.to_msg import disparity_image, odometry, transform_message
-from stages.data import Pose, Transform
+from recordings.ros2.to_msg import disparity_image, odometry
+from stages.data import Pose
 from tests.recordings.sinks.recorded_scene import scene
 
 
@@ -24,18 +24,6 @@ def test_poses_differ_by_a_distance_and_an_angle(degrees, sign):
     found = measures("nav_msgs/msg/Odometry", odometry(one), odometry(other))
     assert found["largest position mm"] == pytest.approx(20.0)
     assert found.get("largest angle deg", 0.0) == pytest.approx(degrees, abs=1e-6)
-
-
-def test_transforms_are_compared_between_the_same_frames():
-    def message(*transforms):
-        return transform_message((Transform(*frames, turned(angle).as_matrix(), place), 0) for *frames, angle, place in
-                                 transforms)  # fmt: skip
-
-    one = message(("odom", "level", 0.0, np.zeros(3)), ("level", "camera", 5.0, np.ones(3)))
-    other = message(("level", "camera", 7.0, np.array([1.0, 1.0, 1.3])), ("a", "b", 0.0, np.zeros(3)))
-    found = measures("tf2_msgs/msg/TFMessage", one, other)
-    assert found == {"transforms only in A": 1.0, "transforms only in B": 1.0,
-                     "largest position mm": pytest.approx(300.0), "largest angle deg": pytest.approx(2.0)}  # fmt: skip
 
 
 def test_equal_disparities_of_another_camera_differ_by_its_baseline():
