@@ -2,6 +2,7 @@
 
 import re
 import shutil
+import sys
 
 import cv2
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from flow.cli.explanation import why
 from flow.cli.instants import part_of
 from flow.cli.regional_explanation import why_regional
+from flow.cli.result_input import graph_of
 from recordings import McapSource
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
@@ -20,6 +22,23 @@ from stages.data import Cell
 from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, rewrite, roverflow, slow
 
 AT = 1.0
+OWN_STAGE = """
+from dataclasses import dataclass
+from stages import StereoFrame
+
+@dataclass(frozen=True)
+class Pass:
+    def __call__(self, frame: StereoFrame) -> StereoFrame:
+        return frame
+"""
+OWN_PIPELINE = """
+source: {use: recordings.McapSource}
+streams:
+  stereo:    {use: flow.align.pair, left: left, right: right}
+  passed:    {use: own_stage.Pass, frame: stereo}
+  disparity: {use: stages.Match, frame: passed, disparities: 16}
+sinks: [{use: recordings.McapSink, results: [disparity]}]
+"""
 
 
 def messages(result, topic):
@@ -133,6 +152,22 @@ def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result
         assert ("fewer points than min_points" in because) == few
     (x, y), *_ = places(fast_result, stamp, Cell.FREE, 1)
     assert not why(fast_result, AT, cell=(x, y), log=traverse).doubts
+
+
+def test_a_stage_of_ones_own_is_found_in_the_working_folder(traverse, tmp_path, monkeypatch, refused):
+    (tmp_path / "own_stage.py").write_text(OWN_STAGE)
+    (tmp_path / "own.yaml").write_text(OWN_PIPELINE)
+    out, path = tmp_path / "own-nav.mcap", [*sys.path]
+    assert roverflow("run", traverse, "-p", tmp_path / "own.yaml", "-o", out) == 0
+    for folder, found in ((tmp_path, True), (tmp_path.parent, False)):
+        monkeypatch.setattr(sys, "path", [*path])
+        monkeypatch.delitem(sys.modules, "own_stage", raising=False)
+        monkeypatch.chdir(folder)
+        if found:
+            assert "passed" in graph_of(out).kinds
+        else:
+            assert "no module 'own_stage'" in (sentence := refused("why", out, "--at", AT, "--cell", "1,1"))
+            assert "; set PYTHONPATH to its folder\n" in sentence
 
 
 def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, said):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -23,6 +24,7 @@ def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = Fa
     from recordings.scoring.result_log import facts_of, pipeline_of
 
     about = facts_of(result, "the log that roverflow run wrote")
+    sys.path.append(str(Path.cwd()))  # so that stages can be in this folder
     with TemporaryDirectory(prefix="roverflow-why-") as folder:
         file = Path(folder) / f"{pipeline_of(result)}.yaml"
         file.write_text(about["pipeline"], encoding="utf-8")

@@ -119,7 +119,8 @@ def class_at(use: str, place: YamlLocation) -> type:
         if error.name != module_name.partition(".")[0]:
             raise place.error(f"cannot import '{module_name}': {error}") from error
         where = f"beside {place.file}" if place.line else "in the folder"
-        raise place.error(f"there is no module '{error.name}' {where} or on the Python path") from error
+        remedy = "set PYTHONPATH to its folder"
+        raise place.error(f"there is no module '{error.name}' {where} or on the Python path; {remedy}") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         trace = error.__traceback__
         while trace is not None and trace.tb_frame.f_code.co_name != "<module>":  # of the import itself
