@@ -19,7 +19,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
-from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, rewrite, roverflow, slow
+from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, mcap_rows, rewrite, roverflow, slow, write_mcap
 
 AT = 1.0
 OWN_STAGE = """
@@ -175,6 +175,19 @@ def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, said)
     x, y = (start + 0.5 * grid.resolution for start in grid.origin)
     output = said(0, "why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse).out
     assert "unknown, reason unobserved\nno height, so no limit applies\n" in output
+
+
+def test_the_files_of_a_log_in_parts_are_found_beside_the_result_and_taken_by_log(traverse, tmp_path, said):
+    rows, out = mcap_rows(traverse), tmp_path / "result" / "out.mcap"
+    middle = rows[0][3] + 10**9
+    parts = [write_mcap(tmp_path / f"part_{n}.mcap", [r for r in rows if (r[3] > middle) == n]) for n in (0, 1)]
+    out.parent.mkdir()
+    assert roverflow("run", *parts, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
+    words = ("--at", AT, "--cell", "3,0")
+    explained = said(0, "why", out, *words, "--log", *parts).out
+    shutil.move(out, tmp_path)
+    beside = said(0, "why", tmp_path / out.name, *words).out
+    assert explained.splitlines()[:-1] == beside.splitlines()[:-1] != []
 
 
 @pytest.mark.parametrize("regional", [(), ("--map", "regional_navigation_map")])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -124,7 +124,7 @@ def why(
     *,
     cell: tuple[float, float] | None = None,
     pixel: tuple[int, int] | None = None,
-    log: Path | str | None = None,
+    log: Path | str | Sequence[Path | str] | None = None,
     stream: str = "navigation_map",
 ) -> Explanation:
     """Explain a cell of one frame's navigation map.
@@ -139,8 +139,8 @@ def why(
         x and y in the map's frame, m.
     pixel : (int, int), optional
         Column and row in the left rectified image, instead of the cell; its ground's cell is explained.
-    log : Path, optional
-        The input log; by default the one that the result names, beside it.
+    log : Path or sequence of Path, optional
+        The input log, or its files; by default the one that the result names, beside it.
     stream : str
         The navigation map.
 
@@ -163,7 +163,7 @@ def why(
     """
     from stages.kernel_loading import loading_kernels
 
-    result, log = Path(result), Path(log) if log is not None else None
+    result = Path(result)
     graph = graph_of(result)
     rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
     if stream not in rules:

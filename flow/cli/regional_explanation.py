@@ -5,7 +5,7 @@ Everything is in the result log, so nothing runs again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, groupby
 from pathlib import Path
@@ -59,7 +59,7 @@ def why_regional(
     at: Instant,
     cell: tuple[float, float],
     *,
-    log: Path | None = None,
+    log: Path | str | Sequence[Path | str] | None = None,
     stream: str = "regional_navigation_map",
 ) -> RegionalExplanation:
     """Explain a cell of the first regional map from an instant on, or of the last one.
@@ -72,8 +72,8 @@ def why_regional(
         Seconds after the first message of the input log, or a stamp, or the time of the day, UTC, of one.
     cell : (float, float)
         x and y in the map's frame, m.
-    log : Path, optional
-        The input log; by default the one that the result names, beside it. Only seconds after its start need it.
+    log : Path or sequence of Path, optional
+        The input log, or its files; by default the one that the result names, beside it. Only seconds after its start need it.
     stream : str
         The navigation map.
 

@@ -43,8 +43,8 @@ def note_damage(result: Path) -> None:
 
 
 @contextmanager
-def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[McapLog]:
-    """The opened input of a result log: `log`, or the one that the result names, beside it.
+def input_of(graph: Graph, result: Path, log: Path | str | Sequence[Path | str] | None = None) -> Iterator[McapLog]:
+    """The opened input of a result log: `log`, a file or several, or those that the result names, beside it.
 
     Raises UsageError if it is not there, cannot be read, or has none of the result's frames.
     """
@@ -52,10 +52,14 @@ def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[Mc
     from recordings.scoring.result_log import about_run
 
     named = about_run(result)["log"]
-    given = log or result.with_name(named)
-    if not given.exists():
-        missing = f"the input of {result}, {named}, is not beside it; give it with --log"
-        raise UsageError(missing if log is None else f"there is no log {log}, which --log names")
+    beside = [[result.with_name(name) for name in names] for names in ([named], named.split(", "))]
+    given = next((files for files in beside if all(file.exists() for file in files)), beside[0])
+    if log is not None:
+        given = [Path(log)] if isinstance(log, Path | str) else [*map(Path, log)]
+    for file in given:
+        if not file.exists():
+            missing = f"the input of {result}, {named}, is not beside it; give it with --log"
+            raise UsageError(missing if log is None else f"there is no log {file}, which --log names")
     with ExitStack() as stack:
         try:
             opened = stack.enter_context(graph.source.open(given))
@@ -66,7 +70,7 @@ def input_of(graph: Graph, result: Path, log: Path | None = None) -> Iterator[Mc
         yield opened
 
 
-def check_input(opened: McapLog, given: Path | Sequence[Path], result: Path, remedy: str = "") -> None:
+def check_input(opened: McapLog, given: Sequence[Path], result: Path, remedy: str = "") -> None:
     """Raise UsageError if an opened log has none of the frames of a result log; say if it has other bytes."""
     from recordings.containers.digest import log_digest
     from recordings.containers.finding import find_files
@@ -76,7 +80,7 @@ def check_input(opened: McapLog, given: Path | Sequence[Path], result: Path, rem
     digest = about_run(result).get("log_digest")
     if digest == log_digest(find_files(given).files):
         return
-    names = ", ".join(map(str, [given] if isinstance(given, Path) else given))
+    names = ", ".join(map(str, given))
     if is_other(opened, stamps_of(result)):
         raise UsageError(f"{names} is not the input of {result}: its frames have other stamps{remedy}")
     if digest is not None:

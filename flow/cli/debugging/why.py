@@ -31,8 +31,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     place = sub.add_mutually_exclusive_group(required=True)
     place.add_argument("--cell", type=pair, metavar="X,Y", help="place in the map's frame, m")
     place.add_argument("--pixel", type=pair, metavar="U,V", help="column and row in the left rectified image")
-    beside = "input of the run (the one that the result names, beside it)"
-    sub.add_argument("--log", type=Path, metavar="LOG", help=beside)
+    beside = "input of the run, a file or several (what the result names, beside it)"
+    sub.add_argument("--log", nargs="+", type=Path, metavar="LOG", help=beside)
     stream = "navigation map (navigation_map)"
     sub.add_argument("--map", default="navigation_map", metavar="STREAM", help=stream)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.png", help="picture with the cell's pixels (OUT-why.png)")
