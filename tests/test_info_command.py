@@ -96,6 +96,20 @@ def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_p
     assert "  #   left: /a/picture\n  #   right: /b/picture\n" in (tmp_path / "other.yaml").read_text()
 
 
+def test_a_written_pipeline_has_its_source_once_whatever_the_comments_in_it(tmp_path, refused):
+    log, own, written = write_sample(tmp_path / "log.mcap"), tmp_path / "own.yaml", tmp_path / "mine.yaml"
+    rest = (SHIPPED / "rover.yaml").read_text().split("source: {use: recordings.McapSource}\n")[1]
+    own.write_text(f"source:\n  use: recordings.McapSource\n# the left one\n  left: {LEFT}\n\n# of rover\n{rest}")
+    assert roverflow("info", log, "-p", own, "--write-pipeline", written) == 0
+    text = written.read_text()
+    assert text.count("  left: ") == 1
+    assert text.endswith(f"\n\n# of rover\n{rest}")
+    assert roverflow("info", log, "-p", written) == 0
+    own.write_text(json.dumps(yaml.safe_load(own.read_text())))
+    sentence = refused("info", log, "-p", own, "--write-pipeline", tmp_path / "other.yaml")
+    assert "has no 'source:' at the beginning of a line" in sentence
+
+
 def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
     found = json.loads(said(0, "info", traverse, "--json").out)["search_range"]
     disparities = [

@@ -31,7 +31,7 @@ AMPLE = 1.5  # times the range that is enough, from which a smaller one is recom
 _STARTING_SECONDS = 2.0  # before the first frame
 # Megabytes of a frame: at any size, and for each megapixel of the left image
 _LOG_MB, _RECORDING_MB = (0.9, 2.0), (0.57, 0.41)
-_SOURCE = re.compile(r"^source:.*\n(?:[ \t]+.*\n)*", re.MULTILINE)
+_COMMENTS = re.compile(r"(^(#.*)?\n)*\Z", re.MULTILINE)  # before the next key, to which they belong
 
 
 def refusal_of(graph: Graph, log: McapLog) -> str:
@@ -87,10 +87,15 @@ def pipeline_for(pipeline: str, source: LogSettings, log: McapLog) -> str:
             lines.append(f"  # either{_note(remedy.condition)}:")
             lines += [f"  #   {name}: {_flow(value)}" for name, value in remedy.settings.items()]
     file = pipeline_file(pipeline)
-    text, count = _SOURCE.subn(lambda _: "\n".join(lines) + "\n", file.read_text(encoding="utf-8"), count=1)
-    if not count:
+    text = file.read_text(encoding="utf-8")
+    root: Any = yaml.compose(text)
+    starts = {key.value: key.start_mark for key, _ in root.value}
+    start = starts["source"].index
+    if root.flow_style or starts["source"].column:
         raise UsageError(f"{file} has no 'source:' at the beginning of a line; write it so")
-    return text
+    end = min((mark.index for mark in starts.values() if mark.index > start), default=len(text))
+    end = start + len(_COMMENTS.sub("", text[start:end], count=1))
+    return text[:start] + "\n".join(lines) + "\n" + text[end:]
 
 
 def _costs(pipeline: str, description: Mapping[str, Any]) -> str:

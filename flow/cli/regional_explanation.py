@@ -73,7 +73,8 @@ def why_regional(
     cell : (float, float)
         x and y in the map's frame, m.
     log : Path or sequence of Path, optional
-        The input log, or its files; by default the one that the result names, beside it. Only seconds after its start need it.
+        The input log, or its files; by default the one that the result names, beside it. Only seconds after its start
+        need it.
     stream : str
         The navigation map.
 
