@@ -127,4 +127,6 @@ def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, refuse
     out.with_suffix(".html").write_text("my own page")
     assert "exists and is no report of roverflow" in refused("report", out)
     assert "is not a result log" in refused("report", traverse)
+    for several in ((tmp_path, out), (out, tmp_path), (out, out, out)):
+        assert "give one or two result logs, or the folder of one fleet" in refused("report", *several)
     assert "missing.mcap: No such file or directory" in refused("report", tmp_path / "missing.mcap")

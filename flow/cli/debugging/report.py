@@ -21,9 +21,9 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Write the page."""
-    if len(options.results) > 2:
-        raise UsageError(f"give one or two result logs, not {len(options.results)}")
     first = options.results[0]
+    if len(options.results) > (1 if any(result.is_dir() for result in options.results) else 2):
+        raise UsageError("give one or two result logs, or the folder of one fleet")
     out = options.out or (first / "report.html" if first.is_dir() else first.with_suffix(".html"))
     check_outputs({"report": out}, options.results)
     if first.is_dir():
