@@ -47,7 +47,7 @@ def test_a_time_of_day_is_that_of_stamps_also_where_they_are_of_another_clock(tm
 
 
 def test_other_times_are_refused(traverse, tmp_path, capsys, refused):
-    for text in ("yesterday", "2023-13-45 00:00:00", "12:03", "-1"):
+    for text in ("yesterday", "2023-13-45 00:00:00", "12:03", "12:75:00", "24:00:00", "-1"):
         with pytest.raises(SystemExit):
             roverflow("try", traverse, f"--at={text}", *SMALL)
         assert "must be seconds after the log's first message, a time as the viewer shows it" in capsys.readouterr().err

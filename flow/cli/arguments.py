@@ -81,7 +81,8 @@ def instant(text: str) -> At:
 
     if text == CURSOR:
         return CURSOR
-    found = re.fullmatch(r"(?:(\d{4}-\d\d-\d\d)[ T])?(\d\d?):(\d\d):(\d\d)(?:\.([\d ]+))?Z?", text.strip())
+    time = r"([01]?\d|2[0-3]):([0-5]\d):([0-5]\d)(?:\.([\d ]+))?Z?"
+    found = re.fullmatch(rf"(?:(\d{{4}}-\d\d-\d\d)[ T])?{time}", text.strip())
     if found:
         date, hours, minutes, whole, fraction = found.groups()
         ns = int((fraction or "0").replace(" ", "")[:9].ljust(9, "0"))
