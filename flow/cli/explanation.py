@@ -178,7 +178,7 @@ def why(
     terrain = items[node.inputs["elevation"]]
     cloud = _last(items, PointCloud, navigation.frame_id)
     if cloud is None:
-        raise UsageError(f"the frame has no points in frame '{navigation.frame_id}', so nothing leads to the pixels")
+        raise _without_pixels(result, navigation.frame_id, f"/nav/{stream}")
     x, y = cell if cell is not None else _place(cloud, pixel)
     place = index_of(navigation, x, y)
     if place is None:
@@ -197,6 +197,16 @@ def why(
         costs=_costs(items, cloud.pixel[inside]),
         **_pixels(_last(items, Disparity), cloud.pixel[inside]),
     )
+
+
+def _without_pixels(result: Path, frame_id: str, topic: str) -> Exception:
+    """The error for a map in a frame without points, such as a regional map, which a result log explains if it can."""
+    from recordings.mcap.file import iter_decoded
+    from recordings.scoring.result_log import without_results
+
+    if next(iter_decoded(result, [topic], Counter()), None) is None:
+        return without_results(result, [topic])
+    return UsageError(f"the frame has no points in frame '{frame_id}'; why_regional explains a regional map")
 
 
 def verdict_at(
