@@ -93,14 +93,12 @@ def write_recording(
         raise LogError("no pair of images was found; check the folder")
     unreadable: list[str] = []
 
-    def resumed(whole: bool) -> None:
-        if not whole:
-            report(f"{out}: an interrupted import of other files or with other options is not continued")
-            return
-        done = sum(len(writer.contained.get(topics[1] + ending, ())) for ending in ENDINGS)
-        report(f"{out}: continues the interrupted import after {counted(done, 'frame')}")
-
-    with ResumableWriter(out, _mark(recording.pairs), resumed) as writer:
+    with ResumableWriter(out, _mark(recording)) as writer:
+        if writer.contained:
+            done = sum(len(writer.contained.get(topics[1] + ending, ())) for ending in ENDINGS)
+            report(f"{out}: continues the interrupted import after {counted(done, 'frame')}")
+        elif writer.others:
+            report(f"{out}: an interrupted import of other images is not continued")
         frames = _frames(recording, cameras[0], tree, topics, writer, unreadable, progress)
         events = merge(*recording.sensors, frames, key=itemgetter(0))
         start = next(events)
@@ -177,14 +175,15 @@ def image_message(stamp: int, frame: str, path: Path, model: CameraModel) -> Any
     return ros2.image(stamp, frame, read_pixels(path))
 
 
-def _mark(pairs: Sequence[ImagePair]) -> str:
-    """What stands for the content of the images: names, sizes and times of change."""
-    digest = sha256()
-    for pair in pairs:
+def _mark(recording: ImportedRecording) -> str:
+    """What stands for the images of the log: stamps, names, sizes and times of change, and the calibration's size."""
+    digest = sha256(repr([(model.width, model.height) for model in recording.cameras]).encode())
+    for pair in recording.pairs:
         for path in (pair.left, pair.right):
             with suppress(OSError):  # it is left out later
                 state = path.stat()
-                digest.update(f"{path.name} {state.st_size} {state.st_mtime_ns}\n".encode(errors="surrogateescape"))
+                line = f"{pair.stamp} {path.name} {state.st_size} {state.st_mtime_ns}\n"
+                digest.update(line.encode(errors="surrogateescape"))
     return digest.hexdigest()[:12]
 
 

@@ -86,10 +86,7 @@ class Ros2Writer:
         kind = message.__msgtype__
         if not 0 <= stamp < LAST_STAMP:
             raise ValueError(f"{kind} for {topic}: the stamp {stamp} ns is outside ROS time; give ns since 1970")
-        if kind not in self._kinds:
-            text, _ = standard_types().generate_msgdef(kind, ros_version=2)
-            self._kinds[kind] = MessageKind(kind, "cdr", "ros2msg", text.encode())
-        self.add(topic, self._kinds[kind], stamp, standard_types().serialize_cdr(message, kind))
+        self.add(topic, self._kind(kind), stamp, standard_types().serialize_cdr(message, kind))
 
     def add(
         self, topic: str, kind: MessageKind, stamp: int, data: bytes | memoryview, copy_of: int | None = None
@@ -155,6 +152,13 @@ class Ros2Writer:
 
     def _open(self) -> BinaryIO:
         return self._partial.open("wb")
+
+    def _kind(self, name: str) -> MessageKind:
+        """A standard type by its name."""
+        if name not in self._kinds:
+            text, _ = standard_types().generate_msgdef(name, ros_version=2)
+            self._kinds[name] = MessageKind(name, "cdr", "ros2msg", text.encode())
+        return self._kinds[name]
 
     def _channel(self, topic: str, kind: MessageKind, copy_of: int | None) -> int:
         if (topic, copy_of) not in self._channels:

@@ -16,6 +16,7 @@ from recordings.importers import recording
 from recordings.importers.files import read_bytes
 from recordings.mcap.resumable import ResumableWriter
 from tests.conftest import roverflow, slow
+from tests.recordings.sample_log import model
 
 PAIRS = 6
 ROOT = Path(__file__).parents[3]
@@ -127,29 +128,38 @@ def test_wherever_the_log_was_cut_or_damaged_the_result_is_the_same(source, inte
             assert out.read_bytes() == whole, place
 
 
-def test_an_import_with_other_options_is_not_continued(source, interrupted, said):
+def test_an_import_that_is_killed_again_loses_nothing_of_the_first_one(source, tmp_path, said, logged):
+    out = tmp_path / "out.mcap"
+    for last in (8, 1, 4, 1):  # the images read before the kill: 3 pairs, none, 1 more, none
+        command = [sys.executable, "-c", CHILD, str(last), str(int(signal.SIGKILL)), *map(str, importing(source, out))]
+        assert subprocess.run(command, cwd=ROOT, check=False).returncode == -signal.SIGKILL
+    assert f"{out}: continues the interrupted import after 4 frames" in said(0, *importing(source, out)).out
+    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
+    assert {name[0] for name in logged} == {"4", "5"}
+
+
+def test_only_the_images_of_an_import_with_other_options_are_copied(source, interrupted, logged):
     out, fresh = interrupted.with_name("out.mcap"), interrupted.with_name("fresh.mcap")
+    assert roverflow(*importing(source, out, pitch_down=20)) == 0
+    assert {name[0] for name in logged} == {"3", "4", "5"}
     assert roverflow(*importing(source, fresh, pitch_down=20)) == 0
-    text = said(0, *importing(source, out, pitch_down=20)).out
-    assert f"{out}: an interrupted import of other files or with other options is not continued" in text
     assert out.read_bytes() == fresh.read_bytes()
     assert sorted(path.name for path in out.parent.iterdir()) == ["fresh.mcap", "out.mcap"]
 
 
-def test_a_log_is_continued_as_far_as_its_messages_are_the_same(source, interrupted, tmp_path, logged):
-    out, fresh, rolls = tmp_path / "out.mcap", tmp_path / "fresh.mcap", tmp_path / "attitudes.csv"
-    (options := [*importing(source, out)])[-4:-2] = ["--attitudes", rolls]
-    rows = [f"{number}-left,15,{number}\n" for number in range(PAIRS)]
-    rolls.write_text("name,pitch_down,roll\n" + "".join(rows))
-    assert roverflow(*options) == 0
-    out.rename(interrupted)
-    rolls.write_text("name,pitch_down,roll\n" + "".join([*rows[:3], "3-left,15,0\n", *rows[4:]]))
-    logged.clear()
-    assert roverflow(*options) == 0
-    assert {name[0] for name in logged} == {"3", "4", "5"}
-    options[3] = fresh
-    assert roverflow(*options) == 0
+def test_an_import_with_other_stamps_is_not_continued(source, interrupted, said):
+    out, fresh = interrupted.with_name("out.mcap"), interrupted.with_name("fresh.mcap")
+    assert roverflow(*importing(source, fresh), "--rate", 20) == 0
+    text = said(0, *importing(source, out), "--rate", 20).out
+    assert f"{out}: an interrupted import of other images is not continued" in text
     assert out.read_bytes() == fresh.read_bytes()
+
+
+def test_an_import_for_another_size_of_images_is_not_continued(source):
+    pairs = [recording.ImagePair(1, source / "pairs" / "0-left.png", source / "pairs" / "0-right.png")]
+    of = [recording.ImportedRecording((model(width=size),) * 2, True, pairs, []) for size in (320, 640)]
+    assert recording._mark(of[0]) != recording._mark(of[1])
 
 
 def test_an_import_of_an_image_that_changed_is_not_continued(source, interrupted, capsys):
@@ -171,6 +181,5 @@ def test_two_imports_of_one_log_do_not_mix(source, interrupted, said):
     with ResumableWriter(out, mark) as other:
         assert "is being written by another import" in said(1, *importing(source, out)).err
         other.abort()
-    assert interrupted.exists()  # as it was not changed yet
-    assert roverflow(*importing(source, out)) == 0
+    assert "continues the interrupted import after 3 frames" in said(0, *importing(source, out)).out
     assert out.read_bytes() == (source / "whole.mcap").read_bytes()
