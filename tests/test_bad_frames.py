@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,6 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.ros2.cdr import make
 from recordings.scoring.metrics import aligned
-from stages.data import Disparity, PixelOrigin
-from stages.stage import Stage, parameter
 from tests.conftest import FRAMES, edit_of, rewrite, roverflow, slow
 
 BAD = 1  # the frame that is made bad
@@ -135,45 +132,3 @@ def test_a_run_without_points_writes_no_map(traverse, tmp_path, said):
     counts = Counter(topic for topic, _, _ in iter_decoded(out))
     assert counts["/nav/disparity"] == FRAMES
     assert not counts.keys() & set(MAPS)
-
-
-@dataclass(frozen=True)
-class WithoutNaN(Stage):
-    """Writes a number in place of NaN."""
-
-    number: float | None = parameter(None, "disparity of unknown pixels; none: NaN", unit="px")
-    honest: bool = parameter(True, "whether the source of these pixels remains one of unknown ones")
-
-    def __call__(self, disparity: Disparity) -> Disparity:
-        unknown = np.isnan(disparity.pixels)
-        source = disparity.source if self.honest else np.full_like(disparity.source, PixelOrigin.MEASURED)
-        number = np.float32(np.nan if self.number is None else self.number)
-        return replace(disparity, pixels=np.where(unknown, number, disparity.pixels), source=source)
-
-
-ZEROS = """
-source: {use: recordings.McapSource}
-streams:
-  stereo:  {use: flow.align.pair, left: left, right: right, slop: 5 ms}
-  matched: {use: stages.Match, frame: stereo, disparities: 64}
-  own:     {use: tests.test_bad_frames.WithoutNaN, disparity: matched, number: %s, honest: %s}
-sinks: [{use: recordings.RerunSink}]
-"""
-
-
-@pytest.mark.parametrize(
-    ("number", "honest", "doubt"),
-    [
-        ("0 px", False, "have the disparity 0 px, infinitely far or beyond; unknown is NaN"),
-        ("-1 px", False, "have the disparity -1 px, infinitely far or beyond; unknown is NaN"),
-        ("5 px", True, "have a disparity, but the source of unknown ones; unknown is NaN"),
-        ("null", True, ""),
-    ],
-)
-def test_a_run_warns_of_a_stage_that_writes_a_number_for_unknown(traverse, tmp_path, said, number, honest, doubt):
-    (tmp_path / "own.yaml").write_text(ZEROS % (number, str(honest).lower()))
-    output = said(0, "run", traverse, "-p", tmp_path / "own.yaml", "-o", tmp_path / "out.mcap").out
-    warnings = [line for line in output.splitlines() if line.startswith("WARNING: own")]
-    assert len(warnings) == bool(doubt)
-    named = r"WARNING: own: tests\.test_bad_frames\.WithoutNaN: \d+% of the pixels "
-    assert all(re.fullmatch(f"{named}{doubt}", line) for line in warnings)

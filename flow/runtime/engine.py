@@ -122,7 +122,6 @@ class Engine:
         self._reporting = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
         self.admitted = self.through = self.complete = 0
-        self.doubts: list[tuple[int, str, str]] = []  # of results: stamp, stream, sentence
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
         self.waiting = 0.0  # s that `admit` waited for room
         self.reading = 0.0  # s that the caller took to read the frames, which it sets
@@ -359,8 +358,6 @@ class Engine:
             if value is None and (missing or node.sparse):
                 return missing or Unchanged()
             node.check(value, given.values(), frame.stamp)
-            if node.own and (doubts := getattr(value, "doubts", ())):
-                self.doubts.append((frame.stamp, node.name, f"{node.use}: {'; '.join(doubts)}"))
             return value
 
         large = bool(getattr(node.actor, "large", False))

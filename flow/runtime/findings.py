@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -28,13 +28,10 @@ def checked(returned: Any) -> Finding | None:
     return returned
 
 
-def findings(
-    graph: Graph, states: Mapping[str, Any], surveys: Mapping[str, Finding], doubts: Iterable[tuple[int, str, str]] = ()
-) -> dict[str, Finding]:
+def findings(graph: Graph, states: Mapping[str, Any], surveys: Mapping[str, Finding]) -> dict[str, Finding]:
     """Stream -> finding at the end of a run: why it was left out, or what `finding(state)` of its stage returns.
 
-    surveys: stream -> finding of its pre-pass; doubts: of results of stages: stamp, ns, stream, sentence. The first one
-    of a stream becomes a warning.
+    surveys: stream -> finding of its pre-pass.
     """
     found: dict[str, Finding | None] = {name: Finding(f"left out: {why}") for name, why in graph.left_out.items()}
     for node in graph.stages:
@@ -43,8 +40,6 @@ def findings(
                 found[node.name] = checked(node.actor.finding(states[node.name]))
             except Exception as error:  # must not leave the outputs open
                 found[node.name] = warning(failure(error))
-    for _, name, doubt in sorted(doubts, reverse=True):
-        found[name] = warning(doubt)
     return explained({name: finding for name, finding in found.items() if finding is not None}, surveys)
 
 

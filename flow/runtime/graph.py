@@ -73,11 +73,6 @@ class Node:
         """Whether the actor is a stage that may return None, where a frame has nothing new."""
         return not self.aligns and NoneType in get_args(_returned(type(self.actor)))
 
-    @property
-    def own(self) -> bool:
-        """Whether the stage is a user's own, not one of the product."""
-        return _is_own(type(self.actor))
-
     def check(self, value: Any, given: Iterable[Any], stamp: int) -> None:
         """Refuse a result of another type, or with a stamp of neither the frame nor an input. A flush may be older."""
         if why := misfit(value, self.output):

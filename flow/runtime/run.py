@@ -168,7 +168,7 @@ def run(
         sinks.errors += [engine.failure] if engine.failure else []
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times |= {"cpu_seconds": time.process_time() - cpu, "survey_cpu_seconds": prepared.cpu_seconds}
-        found = _notes(log, graph) | findings(graph, engine.states, prepared.findings, engine.doubts)
+        found = _notes(log, graph) | findings(graph, engine.states, prepared.findings)
         faulty = has_fault(found) or has_fault(prepared.findings)
         complete = at_end and not faulty and engine.complete == engine.admitted and not len(ledger) and not sinks.errors
         sinks.discard(only_empty=engine.through > 0)

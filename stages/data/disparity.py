@@ -8,9 +8,6 @@ import numpy as np
 
 from stages.data.arrays import Array, publish, publish_stamp
 from stages.data.camera import StereoCamera
-from stages.data.pixel_validity import known
-
-MIN_DOUBTED_SHARE = 0.01  # of the pixels; fewer may be matches of the sky
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,21 +65,6 @@ class Disparity:
             publish(self, "sigma", self.pixels.shape, np.float32)
         if self.costs is not None:
             publish(self, "costs", (2, *self.pixels.shape), np.uint8)
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """What shows that unknown pixels are not NaN, a sentence; a run asks for it where the stage is a user's own."""
-        infinity = 0.0 if self.camera is None else self.camera.cx - self.camera.cx_right
-        beyond = self.pixels[self.pixels <= infinity]
-        level = np.percentile(beyond, 50, method="nearest") if beyond.size else np.float32(0)
-        same = np.count_nonzero(beyond == level) / max(self.pixels.size, 1)
-        if same >= MIN_DOUBTED_SHARE:
-            distance = f"the disparity {level:g} px, infinitely far or beyond"
-            return (f"{same:.0%} of the pixels have {distance}; unknown is NaN",)
-        unknown = np.count_nonzero(np.isfinite(self.pixels) & ~known(self.source)) / max(self.pixels.size, 1)
-        if unknown >= MIN_DOUBTED_SHARE:
-            return (f"{unknown:.0%} of the pixels have a disparity, but the source of unknown ones; unknown is NaN",)
-        return ()
 
 
 @dataclass(frozen=True)
