@@ -133,8 +133,8 @@ def test_an_output_replaces_only_an_earlier_one_of_its_kind(traverse, result, tm
         assert is_ours(tmp_path / "empty", kind)
 
 
-def test_a_recording_of_another_application_is_replaced(tmp_path):
-    sink, recording = RerunSink(application_id="desk"), tmp_path / "out.rrd"
+def test_a_recording_of_another_program_is_none_of_ours(tmp_path):
+    sink, recording = RerunSink(), tmp_path / "out.rrd"
     sink.open(recording, {}, {"log": "traverse.mcap", "pipeline": "# a line of many\n" * 5000})
     sink.close({"verdict": "COMPLETE"})
     assert is_ours(recording, "recording")

@@ -20,6 +20,7 @@ from rerun.blueprint.encodings import TextLogColumnKind, TimelineColumn
 from recordings.errors import LogError
 from stages.data import LEVEL_FRAME
 
+APPLICATION = "roverflow"  # whose recordings share the layout that the viewer saves
 CLOCK = "log clock"  # the timeline of the frames' stamps
 FRAME = "frame"  # the timeline that counts frames
 
@@ -89,7 +90,6 @@ class Layout:
     are plotted with their names.
     """
 
-    application_id: str
     views: Specs
     slowest: tuple[str, ...] = ()
 
@@ -101,7 +101,7 @@ class Layout:
     def as_json(self) -> str:
         """The text that a recording keeps."""
         views = [[spec.panel.name, *[*vars(spec).values()][1:]] for spec in self.views]
-        return json.dumps({"application_id": self.application_id, "slowest": self.slowest, "views": views})
+        return json.dumps({"slowest": self.slowest, "views": views})
 
 
 def read_layout(recording: Path) -> Layout:
@@ -116,7 +116,7 @@ def read_layout(recording: Path) -> Layout:
                 (text,) = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1]
                 found = json.loads(text)
                 views = tuple(ViewSpec(Panel[panel], *rest) for panel, *rest in found["views"])
-                return Layout(found["application_id"], views, tuple(found["slowest"]))
+                return Layout(views, tuple(found["slowest"]))
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise LogError(f"cannot read {recording} as a recording: {error}; run the log again") from error
     raise LogError(f"{recording} keeps no layout: its run was cut short, or another program made it; run the log again")

@@ -41,6 +41,7 @@ CAMERA_RGB: Rgb = (255, 210, 60)
 VEIL: tuple[int, int, int, int] = (96, 100, 112, 170)  # over guesses
 CURVE_RGB: tuple[Rgb, ...] = ((255, 210, 60), (95, 175, 255), (245, 120, 95), (125, 215, 140), (205, 145, 245))
 MIN_WHOLE_WIDTH, MAX_WHOLE_WIDTH, MIN_SMALL_WIDTH = 320, 640, 120  # px, of pictures of results; of intermediates
+MAX_POINTS = 8_000  # of a cloud
 LEGEND_COLUMNS = (4, 3)  # of a single row, and of several, which have the longer names
 VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
     cv2.COLORMAP_TURBO: rr.components.Colormap.Turbo,
@@ -65,7 +66,6 @@ class Canvas:
 
     recording: rr.RecordingStream
     jpeg_quality: int
-    max_points: int
     max_width: int  # of a picture, px; 0: by the camera's images
     pictures: bool = True  # whether this frame's images, clouds and surfaces are drawn
     full_size: frozenset[str] = frozenset()  # streams of disparities and images that are no intermediates

@@ -98,9 +98,9 @@ def disparity_colors(disparity: Array, limit: float | None = None) -> Array:
     return apply_palette(disparity, 0.0, disparity_limit(disparity) if limit is None else limit, cv2.COLORMAP_TURBO)
 
 
-def stride(width: int, max_width: int) -> int:
-    """The n of the n-th pixels that a picture of at most `max_width` px has."""
-    return max(1, -(-width // max_width))
+def stride(length: int, max_length: int) -> int:
+    """The n of the n-th ones, of so many, that are at most `max_length`."""
+    return max(1, -(-length // max_length))
 
 
 def every_nth(pixels: Array, max_width: int) -> Array:

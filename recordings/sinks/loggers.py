@@ -13,7 +13,7 @@ from recordings.png import png
 from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
-from recordings.sinks.canvas import CAMERA_RGB, Canvas, label_counts
+from recordings.sinks.canvas import CAMERA_RGB, MAX_POINTS, Canvas, label_counts
 from recordings.sinks.entity_rows import drawn
 from stages.data import (
     LEVEL_FRAME,
@@ -185,7 +185,7 @@ def log_cloud(canvas: Canvas, stream: str, cloud: PointCloud) -> str:
     """Every n-th point, if the sensor's pose is known; a cloud in the camera's own frame is not drawn."""
     if cloud.sensor is not None:
         if canvas.pictures:
-            some = slice(None, None, max(1, -(-len(cloud.points) // canvas.max_points)))
+            some = slice(None, None, colormaps.stride(len(cloud.points), MAX_POINTS))
             places = np.rint(POINT_STEPS * cloud.points[some]) / np.float32(POINT_STEPS)
             colors = colormaps.fewer_shades(cloud.colors[some])
             points = drawn(rr.Points3D, positions=places, colors=colors, radii=rr.Radius.ui_points(2.0))
@@ -203,7 +203,7 @@ def log_voxels(canvas: Canvas, stream: str, voxels: VoxelMap) -> str:
     caption = f"{stream} {counted(len(voxels.index), 'voxel')}"
     if not canvas.pictures:
         return caption
-    some = slice(None, None, max(1, -(-len(voxels.index) // canvas.max_points)))
+    some = slice(None, None, colormaps.stride(len(voxels.index), MAX_POINTS))
     centres = (voxels.index[some] + np.float32(0.5)) * np.float32(voxels.resolution)
     colors = colormaps.fewer_shades(voxels.colors[some])
     shape = {"centers": centres, "half_sizes": np.full_like(centres, voxels.resolution / 2), "colors": colors}

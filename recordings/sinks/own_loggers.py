@@ -11,8 +11,8 @@ import rerun as rr
 
 from recordings.ros2.plain import is_image, is_points
 from recordings.sinks.blueprint import Panel, ViewSpec
-from recordings.sinks.canvas import Canvas
-from recordings.sinks.colormaps import value_limits
+from recordings.sinks.canvas import MAX_POINTS, Canvas
+from recordings.sinks.colormaps import stride, value_limits
 from recordings.sinks.loggers import LOGGERS
 from recordings.sinks.own_types import leaves
 from stages.data import LEVEL_FRAME, Array
@@ -48,7 +48,7 @@ def _log_array(canvas: Canvas, spec: ViewSpec, array: Array) -> None:
     if array.ndim > 1 and not canvas.pictures:
         return
     if is_points(array):
-        some = slice(None, None, max(1, -(-len(array) // canvas.max_points)))
+        some = slice(None, None, stride(len(array), MAX_POINTS))
         points = rr.Points3D(array[some].astype(np.float32), radii=rr.Radius.ui_points(1.5))
         canvas.log(spec.path, points, replace(spec, panel=Panel.CLOUD))
     elif is_image(array):

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -21,6 +21,7 @@ from flow.contracts import FrameRecord, Loss, counted
 from recordings.atomic_write import give_name, room_to_grow, temporary_name, unwritable, writing
 from recordings.follower import Follower
 from recordings.sinks.blueprint import (
+    APPLICATION,
     CLOCK,
     FRAME,
     FRAMES,
@@ -40,8 +41,10 @@ from recordings.sinks.entity_rows import BATCH_BYTES, clocks_of
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
-from recordings.sinks.settings import RecordingSettings
 from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
+
+if TYPE_CHECKING:
+    from recordings.sinks.rerun_sink import RerunSink
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
@@ -67,9 +70,7 @@ class RerunRecording:
     streams: name -> type of item, in the pipeline's order; about: facts of the run for its summary.
     """
 
-    def __init__(
-        self, settings: RecordingSettings, path: Path, streams: Mapping[str, type], about: Mapping[str, str]
-    ) -> None:
+    def __init__(self, settings: RerunSink, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         self._settings, self._path, self._streams, self._about = settings, Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
         self._viewer: Follower | None = None
@@ -93,7 +94,6 @@ class RerunRecording:
         self._canvas = Canvas(
             self._recording,
             settings.jpeg_quality,
-            settings.max_points,
             settings.max_width,
             sized=frozenset(sized),
             matched=frozenset(disparities[-2:-1]),
@@ -111,7 +111,7 @@ class RerunRecording:
     def _begin(self) -> None:
         self._check_room()
         batches = rr.ChunkBatcherConfig(flush_tick=BATCH_SECONDS, flush_num_bytes=BATCH_BYTES)
-        self._recording = rr.RecordingStream(self._settings.application_id, batcher_config=batches)
+        self._recording = rr.RecordingStream(APPLICATION, batcher_config=batches)
         self._recording.set_log_time_enabled(False)
         self._recording.set_sinks(rr.FileSink(str(self._partial)))
         if self._settings.live_pipe:
@@ -310,7 +310,7 @@ class RerunRecording:
 
     def _layout(self) -> Layout:
         slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
-        return Layout(self._settings.application_id, tuple(self._canvas.views.values()), tuple(slowest))
+        return Layout(tuple(self._canvas.views.values()), tuple(slowest))
 
 
 def _is(kind: Any, wanted: type) -> bool:

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from flow.contracts import FrameRecord
+from flow.parameters import Checked, parameter
 from recordings.errors import LogError
+from recordings.sinks import DESKS
 from recordings.sinks.overwrite import refuse_foreign
 from recordings.sinks.own_types import NUMBERS, plain_type
-from recordings.sinks.settings import RecordingSettings
 from stages.data import Mount, Region
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class RerunSink(RecordingSettings):
+class RerunSink(Checked):
     """Writes a rerun recording, which `rerun FILE.rrd` opens.
 
     A type of `stages.data` is drawn by its logger. Of other types, images, numbers, texts, points, and tables and
@@ -37,6 +38,28 @@ class RerunSink(RecordingSettings):
     >>> RerunSink(jpeg_quality=95).wants("sharpness", float)
     True
     """
+
+    max_width: int = parameter(
+        0, "widest picture; an intermediate has three eighths of it. 0: half as wide as the camera's images, but 320 "
+        "to 640 px, and intermediates 120 to 240 px",
+        low=0, unit="px",
+    )  # fmt: skip
+    jpeg_quality: int = parameter(75, "of the camera images", low=1, high=100)
+    every: int = parameter(1, "images, clouds and surfaces of each n-th frame are drawn", low=1)
+    max_megabytes: int = parameter(
+        0, "room of the recording before its compression; 0: no limit. Images, clouds and surfaces are drawn half as "
+        "often each time that half of the remaining room is used",
+        low=0, unit="MB",
+    )  # fmt: skip
+    live_pipe: int = parameter(
+        0, "file descriptor of a pipe to a viewer, which gets the recording while it is written; 0: none", low=0
+    )
+    without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
+    limits: tuple[str, ...] = parameter(
+        (),
+        "limits of layers, as elevation_map/step=0.17, which their scales show; `run` sets those of the hazard rule",
+    )
+    desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     suffix = ".rrd"
     asks: ClassVar = {"keep_costs": True}  # of matchers

@@ -23,7 +23,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write a file for each desk."""
     from recordings.scoring.result_log import about_run
-    from recordings.sinks.blueprint import read_layout
+    from recordings.sinks.blueprint import APPLICATION, read_layout
 
     if about_run(options.recording):
         recording = options.recording.with_suffix(".rrd").name
@@ -35,6 +35,6 @@ def run(options: argparse.Namespace) -> int:
     layout = read_layout(options.recording)
     for name, path in paths.items():
         with written(path) as temporary:
-            layout.blueprint(name).save(layout.application_id, str(temporary))
+            layout.blueprint(name).save(APPLICATION, str(temporary))
         say(f"wrote {path}; rerun {options.recording} {path} shows it")
     return COMPLETE

@@ -93,6 +93,13 @@ def scene(stamp: int = START) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def resized(cloud: PointCloud, count: int) -> PointCloud:
+    """The points of a cloud, repeated up to a number."""
+    sigma, pixel = (np.resize(values, count) for values in (cloud.sigma, cloud.pixel))
+    points, colors = (np.resize(values, (count, 3)) for values in (cloud.points, cloud.colors))
+    return replace(cloud, points=points, colors=colors, sigma=sigma, pixel=pixel)
+
+
 def record_of(
     path: Path,
     records: Iterable[Record],

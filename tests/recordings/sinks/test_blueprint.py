@@ -17,7 +17,7 @@ def views(part: Any) -> list[Any]:
 
 
 def container(specs: list[ViewSpec], desk: str = "overview") -> Any:
-    return Layout("roverflow", tuple(specs)).blueprint(desk).root_container
+    return Layout(tuple(specs)).blueprint(desk).root_container
 
 
 def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one():

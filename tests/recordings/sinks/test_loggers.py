@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from recordings.sinks.canvas import Canvas
+from recordings.sinks.canvas import MAX_POINTS, Canvas
 from recordings.sinks.loggers import DEPTH_STEPS, POINT_STEPS, same_view
 from stages.data import LEVEL_FRAME, Cell, ElevationMap, PixelOrigin, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
@@ -19,6 +19,7 @@ from tests.recordings.sinks.recorded_scene import (
     decoded,
     entities,
     record_of,
+    resized,
     rows,
     scene,
 )
@@ -117,14 +118,15 @@ def test_the_same_pixels_are_stored_once(rrd, tmp_path):
 )
 def test_pictures_follow_the_size_of_the_images_unless_a_width_is_set(camera_width, max_width, widths):
     camera = StereoCamera(80, 80, 31.5, 23.5, 0.2, camera_width, 48)
-    canvas = Canvas(None, jpeg_quality=75, max_points=1, max_width=max_width, camera=camera)
+    canvas = Canvas(None, jpeg_quality=75, max_width=max_width, camera=camera)
     assert (canvas.whole_width, canvas.small_width) == widths
 
 
 def test_clouds_are_thinned_by_a_fixed_stride(tmp_path):
-    path = record_of(tmp_path / "few.rrd", [Record(START, scene())], max_points=300)
+    items = scene() | {"points": resized(scene()["points"], 4 * MAX_POINTS)}
+    path = record_of(tmp_path / "few.rrd", [Record(START, items)])
     positions = rows(path, "/points/points", "Points3D:positions")[0][2]
-    np.testing.assert_allclose(positions, scene()["points"].points[::4], rtol=0, atol=0.5 / POINT_STEPS)
+    np.testing.assert_allclose(positions, items["points"].points[::4], rtol=0, atol=0.5 / POINT_STEPS)
 
 
 def test_a_cloud_in_the_camera_frame_is_not_drawn(rrd):
