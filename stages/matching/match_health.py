@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flow.contracts import Finding, Severity
-from stages.data import Disparity, MatchHealth, Mount, PixelOrigin, Tilt
+from stages.data import Disparity, MatchHealth, PixelOrigin
 from stages.stage import Stage, parameter
 
 NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
@@ -21,7 +21,7 @@ NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
 class CheckMatches(Stage):
     """The matched share of each frame, and a warning at the end of a run if little of the nearest ground is matched.
 
-    The nearest ground is in the lowest eighth of the rows, or in the highest if the camera hangs upside down.
+    The nearest ground is in the lowest eighth of the rows.
     """
 
     min_matched: float = parameter(
@@ -32,19 +32,12 @@ class CheckMatches(Stage):
         """The matched shares of the nearest ground, one for each frame of a run; none yet."""
         return []
 
-    def __call__(
-        self, disparity: Disparity, tilt: Tilt | None = None, mount: Mount | None = None, *, state: list[float]
-    ) -> MatchHealth:
-        """The matched share of the right half of the image; the right camera does not see all of the left half.
-
-        tilt, mount: the direction of gravity in the camera; without them the camera is assumed to be upright.
-        """
+    def __call__(self, disparity: Disparity, *, state: list[float]) -> MatchHealth:
+        """The matched share of the right half of the image; the right camera does not see all of the left half."""
         height, width = disparity.pixels.shape
         source = disparity.source[:, width // 2 :]
         matched = (source == PixelOrigin.MEASURED) | (source == PixelOrigin.PLANE)
-        rows = max(1, round(NEAR_ROWS * height))
-        hangs = tilt is not None and mount is not None and (mount.camera_from_inclinometer @ tilt.up)[1] > 0
-        near = float((matched[:rows] if hangs else matched[-rows:]).mean())
+        near = float(matched[-max(1, round(NEAR_ROWS * height)) :].mean())
         state.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 

@@ -5,7 +5,7 @@ import pytest
 
 from flow.contracts import Severity
 from recordings.simulator import Simulation
-from stages import CheckMatches, Disparity, Mount, PixelOrigin, StereoFrame, Tilt
+from stages import CheckMatches, Disparity, PixelOrigin, StereoFrame
 from tests.bench.refining import stereo_part
 from tests.conftest import slow
 from tests.stages.running import Running
@@ -30,14 +30,6 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     found = check.finding()
     assert found.severity == Severity.WARNING
     assert "Only 0 % of the nearest ground is matched" in found.sentence
-
-
-@pytest.mark.parametrize(("up", "near"), [([0.0, -1.0, -0.3], 1), ([0.0, 1.0, -0.3], 0), (None, 1)])
-def test_of_a_camera_that_hangs_upside_down_the_nearest_ground_is_above(up, near):
-    matched = np.ones((80, 100), bool)
-    matched[:10] = False
-    tilt = None if up is None else Tilt(0, np.array(up) / np.linalg.norm(up))
-    assert Running(CheckMatches())(disparity_with(matched), tilt, Mount(0, np.eye(3))).near == near
 
 
 @pytest.fixture(scope="module")
