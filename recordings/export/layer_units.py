@@ -34,6 +34,4 @@ _LAYERS = {
 
 def unit_and_meaning(layer: str) -> tuple[str, str]:
     """Unit (UDUNITS) and meaning of a layer; empty where they are not known."""
-    if layer.startswith("percentile_"):
-        return "m", "percentile of heights"
     return _LAYERS.get(layer, ("", ""))

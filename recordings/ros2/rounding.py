@@ -10,7 +10,6 @@ from stages.data import Array
 
 MANTISSA_BITS = 23  # of a float32
 LENGTHS = {"elevation", "minimum", "maximum", "ground", "step", "ceiling", "filled", "drop"}  # m, of any sign
-PERCENTILE = "percentile_"  # how the names of further lengths begin
 POSITIVE = {"variance", "common_variance", "slope", "steepness", "roughness"}  # where relative errors count
 
 
@@ -19,7 +18,7 @@ def rounded_layer(name: str, values: Array, step: float, precision: float) -> Ar
 
     Counts, codes, shares, times and layers of other names stay as they are; 0 stands for no rounding.
     """
-    if name in LENGTHS or name.startswith(PERCENTILE):
+    if name in LENGTHS:
         return to_multiples(values, step)
     return to_relative(values, precision) if name in POSITIVE else values
 

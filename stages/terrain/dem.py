@@ -15,7 +15,7 @@ from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.data.arrays import spanned
 from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.kernels.cell_layers import VarianceModel, cell_layers
-from stages.terrain.kernels.grid import FIGURES, Grid, cell_percentile, cell_statistics, extent
+from stages.terrain.kernels.grid import FIGURES, Grid, cell_statistics, extent
 from stages.terrain.kernels.occlusion import occlusion_ceiling
 from stages.terrain.kernels.splats import splat_statistics
 from stages.terrain.kernels.staying_points import staying_points
@@ -32,8 +32,7 @@ class Voxelise(Stage):
     """Averages a levelled cloud over the cells of a grid.
 
     Adds the layers elevation, minimum, maximum, count, variance and common_variance; interpolated, occluded and ceiling
-    if the camera is known; filled and unmatched if the cloud contains points that were not measured; percentile_P for
-    each of `percentiles`.
+    if the camera is known; filled and unmatched if the cloud contains points that were not measured.
     docs/terrain.md defines the layers and the model of variance.
 
     Examples
@@ -68,7 +67,6 @@ class Voxelise(Stage):
         0.08, "longest reach in depth; behind depth edges, where depth is least certain, the ground is hidden",
         unit="m", low=0.0,
     )  # fmt: skip
-    percentiles: tuple[float, ...] = parameter((), "further layers: percentiles of a cell's heights, 50 is the median")
     filled: str = parameter(
         "apart", "PLANE and FILLED points: a layer of their own, or counted as measured", choices=("apart", "counted")
     )
@@ -76,8 +74,6 @@ class Voxelise(Stage):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Voxelise.max_range", self.max_range, self.resolution, 2)
-        if not all(0 <= value <= 100 for value in self.percentiles):
-            raise ValueError(f"Voxelise.percentiles must be between 0 and 100, not {self.percentiles}")
 
     def __call__(self, cloud: PointCloud) -> ElevationMap:
         """The elevation map of a cloud in frame `level`."""
@@ -119,8 +115,6 @@ class Voxelise(Stage):
             with np.errstate(invalid="ignore", divide="ignore"):
                 layers["filled"] = np.where(empty, figures[:, :, 1] / figures[:, :, 0], np.nan).astype(np.float32)
             layers["unmatched"] = np.where(empty, match_failure(guessed, grid), np.nan).astype(np.float32)
-        for value in self.percentiles:
-            layers[f"percentile_{value:g}"] = cell_percentile(measured.points, value, grid)
         return grid, layers
 
     @property

@@ -1,7 +1,6 @@
 """Cell statistics of points over a regular grid, in one pass (paper section 4, "voxelisation").
 
 The six running figures of a cell are adjacent in memory, so a point touches one cache line. Sums are float64.
-Percentiles need one sort of all points by cell and height.
 """
 
 from __future__ import annotations
@@ -157,21 +156,6 @@ def shade_statistics_reference(points: Array, colors: Array, grid: Grid) -> Arra
     """The same as `shade_statistics`, in plain numpy."""
     gray = np.column_stack([points[:, :2], colors.mean(axis=1)])
     return cell_statistics_reference(gray, np.zeros(len(points)), grid)[:, :, :3]
-
-
-def cell_percentile(points: Array, percentile: float, grid: Grid) -> Array:
-    """A percentile of each cell's heights, interpolated as numpy does, (rows, cols) float32, NaN without points."""
-    flat, inside = cells_of(points, grid)
-    z = points[inside, 2]
-    order = np.lexsort((z, flat))
-    flat, z = flat[order], z[order].astype(np.float64)
-    cell, start, count = np.unique(flat, return_index=True, return_counts=True)
-    rank = percentile / 100 * (count - 1)
-    below = np.floor(rank).astype(np.int64)
-    low, high = z[start + below], z[start + np.minimum(below + 1, count - 1)]
-    heights = np.full(grid.shape, np.nan, np.float32)
-    heights.flat[cell] = low + (rank - below) * (high - low)
-    return heights
 
 
 def cells_of(points: Array, grid: Grid) -> tuple[Array, Array]:
