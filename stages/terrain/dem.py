@@ -14,7 +14,7 @@ import numpy as np
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.data.arrays import spanned
 from stages.stage import Stage, check_cells, check_level, parameter
-from stages.terrain.kernels.cell_layers import VarianceModel, cell_layers
+from stages.terrain.kernels.cell_layers import VARIANCE, cell_layers
 from stages.terrain.kernels.grid import FIGURES, Grid, cell_statistics, extent
 from stages.terrain.kernels.occlusion import occlusion_ceiling
 from stages.terrain.kernels.splats import splat_statistics
@@ -48,17 +48,6 @@ class Voxelise(Stage):
     max_range: float = parameter(
         8.0, "horizontal range from the level frame's origin (base_link) kept in the map", unit="m", low=0.1, high=200.0
     )
-    correlated_points: float = parameter(4.0, "neighbouring points that share one matching error", low=1.0)
-    systematic_share: float = parameter(
-        0.8, "share of the points' variance that no averaging removes", low=0.0, high=1.0
-    )
-    scatter_share: float = parameter(0.2, "share of the scatter beyond slope and noise in the variance", low=0.0)
-    curvature_share: float = parameter(0.34, "share of the squared curvature in the variance", low=0.0)
-    rim_share: float = parameter(0.15, "share of the squared rise in the variance of a cell beside a hole", low=0.0)
-    sight_share: float = parameter(
-        1.0, "share of the squared fall of the line of sight within a cell, in the variance of an interpolated cell "
-        "beside a hole", low=0.0,
-    )  # fmt: skip
     splat_sigmas: float = parameter(
         0.0, "reach of a measured point along its line of sight, in standard deviations of its depth, into cells "
         "without points; 0 = none", low=0.0,
@@ -104,7 +93,7 @@ class Voxelise(Stage):
         if sensor is not None:
             staying = staying_points(measured.points, measured.sigma, sensor, grid, figures[:, :, 0])
         figures = self._splatted(figures, measured, grid)
-        layers = cell_layers(figures, staying, sensor, cloud.tilt_sigma, self._model, grid)
+        layers = cell_layers(figures, staying, sensor, cloud.tilt_sigma, VARIANCE, grid)
         empty = layers["count"] == 0
         if ceiling is not None:
             layers["ceiling"] = np.where(empty, ceiling[grid.within], np.nan).astype(np.float32)
@@ -116,10 +105,6 @@ class Voxelise(Stage):
                 layers["filled"] = np.where(empty, figures[:, :, 1] / figures[:, :, 0], np.nan).astype(np.float32)
             layers["unmatched"] = np.where(empty, match_failure(guessed, grid), np.nan).astype(np.float32)
         return grid, layers
-
-    @property
-    def _model(self) -> VarianceModel:
-        return VarianceModel(**{name: getattr(self, name) for name in VarianceModel._fields})
 
     def _window(self, cloud: PointCloud, ceiling: Array | None, whole: Grid) -> Grid:
         """The part of the grid that contains the points, their splats and the lines of sight over empty cells."""

@@ -13,10 +13,10 @@ from scipy.ndimage import find_objects
 from stages.cloud.clean import Clean
 from stages.cloud.level import Level
 from stages.cloud.reproject import Reproject
-from stages.data import LEVEL_FRAME, Array, MatchFailure, PixelOrigin, PointCloud, Tilt, Transform
+from stages.data import LEVEL_FRAME, Array, ElevationMap, MatchFailure, PixelOrigin, PointCloud, Tilt, Transform
 from stages.terrain.dem import Voxelise
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature, gradient_and_curvature_reference
-from stages.terrain.kernels.cell_layers import LAYERS, VarianceModel, cell_layers, cell_layers_reference
+from stages.terrain.kernels.cell_layers import LAYERS, VARIANCE, VarianceModel, cell_layers, cell_layers_reference
 from stages.terrain.kernels.grid import (
     Grid,
     cell_statistics,
@@ -89,12 +89,12 @@ def test_the_order_of_points_changes_at_most_the_last_bits() -> None:
 def test_the_layers_of_one_cell_are_those_of_its_points() -> None:
     heights = np.array([0.1, 0.2, 0.6])
     points = np.column_stack([np.full(3, 2.01), np.full(3, -1.02), heights])
-    grid = Voxelise(scatter_share=1.0)(cloud_of(points, 0.0, sensor=None))
+    grid = Voxelise()(cloud_of(points, 0.0, sensor=None))
     row, col = int((-1.02 - grid.origin[1]) / 0.05), int((2.01 - grid.origin[0]) / 0.05)
     value = {name: float(layer[row, col]) for name, layer in grid.layers.items()}
     assert value == pytest.approx(
         {
-            "elevation": 0.3, "minimum": 0.1, "maximum": 0.6, "count": 3, "variance": heights.var(),
+            "elevation": 0.3, "minimum": 0.1, "maximum": 0.6, "count": 3, "variance": 0.2 * heights.var(),
             "common_variance": 0.0,
         }, rel=1e-5,
     )  # fmt: skip
@@ -173,9 +173,11 @@ def test_holes_stay_empty_and_an_empty_cloud_makes_an_empty_map() -> None:
         np.testing.assert_array_equal(np.isnan(full.layers[name]), full.layers["count"] == 0)
 
 
-PURE = Voxelise(
-    correlated_points=1.0, systematic_share=0.0, scatter_share=0.0, curvature_share=0.0, rim_share=0.0, sight_share=0.0
-)
+def variance_of_noise(points: Array, shared: float = 1.0) -> ElevationMap:
+    """The map with the variance of the points' noise only; shared: neighbouring points that share one error."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("stages.terrain.dem.VARIANCE", VarianceModel(shared, 0.0, 0.0, 0.0, 0.0, 0.0))
+        return Voxelise()(cloud_of(points, sigma=0.02))
 
 
 @pytest.mark.parametrize("slope", [-0.1, 0.0, 0.3])
@@ -187,7 +189,7 @@ def test_variance_is_that_of_the_mean_for_independent_errors(slope: float) -> No
     ray = truth - SENSOR.translation
     depth = ray @ SENSOR.rotation[:, 2]
     seen = truth + ray * (random.normal(0, 0.02, len(truth)) / depth)[:, None]
-    grid = PURE(cloud_of(seen, sigma=0.02))
+    grid = variance_of_noise(seen)
     full = grid.layers["count"] > 60
     # Away from the ground's edges, where only points thrown outwards arrive.
     x = grid.origin[0] + (np.arange(320) + 0.5) * 0.05
@@ -197,16 +199,15 @@ def test_variance_is_that_of_the_mean_for_independent_errors(slope: float) -> No
     unevenness = slope**2 * 0.05**2 / 12 / grid.layers["count"][full]
     ratio = (error**2 - unevenness) / grid.layers["variance"][full]
     assert 0.85 < ratio.mean() < 1.25
-    correlated = replace(PURE, correlated_points=25.0)(cloud_of(seen, sigma=0.02)).layers["variance"][full]
+    correlated = variance_of_noise(seen, 25.0).layers["variance"][full]
     np.testing.assert_allclose(correlated, grid.layers["variance"][full] * 25, rtol=1e-4)
 
 
 def test_points_that_share_one_error_have_the_variance_of_one() -> None:
-    shared = replace(PURE, correlated_points=10.0)
     stated = []
     for n in (1, 5, 10, 40):
         places = np.linspace(-0.02, 0.02, n)[:, None] + np.array([[4.025, 0.025, 0.0]])
-        variance = shared(cloud_of(places, sigma=0.02)).layers["variance"]
+        variance = variance_of_noise(places, 10.0).layers["variance"]
         assert np.isfinite(variance).sum() == 1
         stated.append(float(variance[np.isfinite(variance)][0]))
     np.testing.assert_allclose(stated[1:3], stated[0], rtol=0.05)
@@ -246,7 +247,7 @@ def test_layers_kernel_equals_the_reference(sensor: Transform | None) -> None:
     random, points = np.random.default_rng(7), scattered(7, 20000, 6.0).astype(np.float32)
     figures = cell_statistics_reference(points, random.uniform(0, 0.05, len(points)), GRID)
     staying = None if sensor is None else random.integers(0, 12, GRID.shape, np.int32)
-    arguments = figures, staying, sensor, 0.004, VarianceModel(4.0, 0.8, 0.2, 0.34, 0.15, 1.0), GRID
+    arguments = figures, staying, sensor, 0.004, VARIANCE, GRID
     got, want = cell_layers(*arguments), cell_layers_reference(*arguments)
     assert list(got) == list(LAYERS if sensor else LAYERS[:-1]) == list(want)
     for name in got:
