@@ -15,17 +15,13 @@ import numpy as np
 
 from flow.contracts import StageError
 from stages.cloud.kernels.depth_order import out_of_order
-from stages.cloud.kernels.outliers import SupportRule, median_slope, supported, write_depths
-from stages.cloud.kernels.patches import connected_patches, in_patches
+from stages.cloud.kernels.outliers import MAX_SLOPE_RATIO, median_slope, supported, write_depths
+from stages.cloud.kernels.patches import connected_patches
 from stages.data import Array, PointCloud
 from stages.data.arrays import rows_of
 from stages.stage import Stage, parameter
 
-MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
-MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the ground's
-MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image
 KNN_QUERY = 1 << 14  # points whose nearest neighbours are in memory at once
-MIN_NEIGHBOURS = 4  # with fewer a point cannot be judged and is dropped
 
 
 @dataclass(frozen=True)
@@ -88,15 +84,13 @@ class Clean(Stage):
 
         Points beyond the crop count in the order of depth, because the sky begins above them.
         """
-        rule = SupportRule(self._crop, MAX_DEVIATIONS, MAX_SLOPE_RATIO, MIN_AGREEING_SHARE, MIN_NEIGHBOURS)
-        kept, inverse, tolerance = supported(
-            cloud.points, cloud.sigma, cloud.pixel, np.flatnonzero(measured), shape, rule
-        )
+        given = np.flatnonzero(measured)
+        kept, inverse, tolerance = supported(cloud.points, cloud.sigma, cloud.pixel, given, shape, self._crop)
         far = np.flatnonzero(measured & (cloud.points[:, 2] > self._crop))
-        write_depths(cloud.points, cloud.sigma, cloud.pixel, far, MAX_DEVIATIONS, math.inf, inverse, tolerance)
+        write_depths(cloud.points, cloud.sigma, cloud.pixel, far, math.inf, inverse, tolerance)
         patch, sizes = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
         chosen = (sizes >= self.min_patch_share * len(kept)) & ~out_of_order(inverse, patch, sizes)
-        return in_patches(kept, cloud.pixel.take(kept), patch, chosen)
+        return kept[chosen.take(patch.ravel().take(cloud.pixel.take(kept)))]
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""

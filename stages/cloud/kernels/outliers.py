@@ -7,8 +7,6 @@ eight directions, the neighbours whose inverse depth differs by no more than noi
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from stages.compiled.jit import kernel
@@ -22,35 +20,28 @@ OFFSETS = np.array(
 )  # fmt: skip
 
 
-class SupportRule(NamedTuple):
-    """When a point is supported by its neighbours."""
-
-    max_depth_range: float  # m from the camera; farther points are dropped and support no other
-    max_deviations: float  # standard deviations of noise in a difference of inverse depth
-    max_slope_ratio: float  # slope of a surface over the scene's median slope
-    min_agreeing_share: float  # of the neighbours present
-    min_neighbours: int  # present
+MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
+MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the scene's median slope
+MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image
+MIN_NEIGHBOURS = 4  # with fewer a point cannot be judged and is dropped
 
 
 def supported(
-    points: Array, sigma: Array, pixel: Array, chosen: Array, shape: tuple[int, int], rule: SupportRule
+    points: Array, sigma: Array, pixel: Array, chosen: Array, shape: tuple[int, int], max_range: float
 ) -> tuple[Array, Array, Array]:
     """The points that lie on the same surface as enough of their neighbours in the image, of those `chosen`.
 
     points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; chosen: (M,) int64, indices; shape: (H, W) of the image. Returns indices, (K,) int64, and the images of
-    `write_depths` that contain these points only, (H, W) float32 each.
+    int32; chosen: (M,) int64, indices; shape: (H, W) of the image; max_range: m from the camera, farther points are
+    dropped and support no other. Returns indices, (K,) int64, and the images of `write_depths` that contain these
+    points only, (H, W) float32 each.
     """
     inverse, tolerance = (np.full((shape[0] + 2 * RINGS, shape[1] + 2 * RINGS), x, np.float32) for x in (np.nan, 0))
     inside = np.s_[RINGS:-RINGS, RINGS:-RINGS]
-    write_depths(
-        points, sigma, pixel, chosen, rule.max_deviations, rule.max_depth_range, inverse[inside], tolerance[inside]
-    )
-    slope = rule.max_slope_ratio * median_slope(inverse[inside])
+    write_depths(points, sigma, pixel, chosen, max_range, inverse[inside], tolerance[inside])
+    slope = np.float32(MAX_SLOPE_RATIO * median_slope(inverse[inside]))
     agreed = np.zeros(shape, np.bool_)
-    _agree(
-        inverse, tolerance, OFFSETS, np.float32(slope), np.float32(rule.min_agreeing_share), rule.min_neighbours, agreed
-    )
+    _agree(inverse, tolerance, OFFSETS, slope, np.float32(MIN_AGREEING_SHARE), agreed)
     rays = pixel_rays(points, pixel, chosen, int(shape[1]))
     kept = np.empty(len(chosen), np.int64)
     kept = kept[: _keep(points, sigma, pixel, chosen, agreed.reshape(-1), rays, inverse[inside], kept)]
@@ -58,16 +49,15 @@ def supported(
 
 
 def write_depths(
-    points: Array, sigma: Array, pixel: Array, chosen: Array, deviations: float, max_range: float, inverse: Array,
-    tolerance: Array,
-) -> None:  # fmt: skip
+    points: Array, sigma: Array, pixel: Array, chosen: Array, max_range: float, inverse: Array, tolerance: Array
+) -> None:
     """Write the inverse depths of the points `chosen`, 1/m, and the differences that noise explains, into two images.
 
     points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; chosen: (M,) int64; deviations: standard deviations of a difference; max_range: m from the camera, of the
-    points that are written; into inverse, tolerance: (H, W) float32.
+    int32; chosen: (M,) int64; max_range: m from the camera, of the points that are written; into inverse, tolerance:
+    (H, W) float32.
     """
-    _write_depths(points, sigma, pixel, chosen, float(deviations) * np.sqrt(2.0), float(max_range), inverse, tolerance)
+    _write_depths(points, sigma, pixel, chosen, MAX_DEVIATIONS * np.sqrt(2.0), float(max_range), inverse, tolerance)
 
 
 def median_slope(inverse: Array) -> float:
@@ -115,7 +105,7 @@ def _write_depths(points, sigma, pixel, chosen, factor, max_range, inverse, tole
 
 
 @kernel
-def _agree(inverse, tolerance, offsets, slope, share, least, agreed):
+def _agree(inverse, tolerance, offsets, slope, share, agreed):
     """Whether enough of the neighbours of each pixel agree; a row at a time, so that all its pixels share the work."""
     height, width = agreed.shape
     filled = np.zeros(inverse.shape[0], np.bool_)
@@ -136,7 +126,7 @@ def _agree(inverse, tolerance, offsets, slope, share, least, agreed):
                     present[x] += np.float32(1) if apart >= 0 else np.float32(0)
                     agreeing[x] += np.float32(1) if apart <= noise[x] + more else np.float32(0)
         for x in range(width):
-            agreed[row, x] = (present[x] >= least) & (agreeing[x] >= share * present[x])
+            agreed[row, x] = (present[x] >= MIN_NEIGHBOURS) & (agreeing[x] >= share * present[x])
 
 
 @kernel
@@ -160,16 +150,15 @@ def _keep(points, sigma, pixel, chosen, agreed, rays, inverse, kept):
 
 
 def supported_reference(
-    points: Array, sigma: Array, pixel: Array, chosen: Array, shape: tuple[int, int], rule: SupportRule
+    points: Array, sigma: Array, pixel: Array, chosen: Array, shape: tuple[int, int], max_range: float
 ) -> Array:
     """The same as `supported`, in plain numpy: one image-sized shift for each neighbour."""
-    max_range, deviations, slope_ratio, share, least = rule
     points, sigma, pixel = points[chosen], sigma[chosen], pixel[chosen]
     p = points.astype(np.float64)
     near = (p[:, 2] > 0) & ((p**2).sum(axis=1) <= max_range**2)
     inverse = np.full(shape, np.nan, np.float32)
     inverse.ravel()[pixel[near]] = 1 / p[near, 2]
-    slope = slope_ratio * median_slope(inverse)
+    slope = MAX_SLOPE_RATIO * median_slope(inverse)
     rays = pixel_rays(points, pixel, np.arange(len(points)), shape[1])
     row, col = np.divmod(pixel, shape[1])
     own = 1 / np.where(near, p[:, 2], np.nan)
@@ -181,5 +170,6 @@ def supported_reference(
     for k, (dv, du) in enumerate(OFFSETS):
         difference = np.abs(padded[row + dv + RINGS, col + du + RINGS] - own)
         present += np.isfinite(difference)
-        agreeing += difference <= deviations * np.sqrt(2) * sigma * own**2 + slope * (k // 8 + 1)
-    return chosen[near & ~off_ray & (present >= least) & (agreeing >= share * present)]  # type: ignore[no-any-return]
+        agreeing += difference <= MAX_DEVIATIONS * np.sqrt(2) * sigma * own**2 + slope * (k // 8 + 1)
+    agreed = (present >= MIN_NEIGHBOURS) & (agreeing >= MIN_AGREEING_SHARE * present)
+    return chosen[near & ~off_ray & agreed]  # type: ignore[no-any-return]

@@ -77,31 +77,6 @@ def _connected_patches(inverse, tolerance, slope):
     return parent.reshape(height, width), sizes[:patches]
 
 
-def in_patches(kept: Array, pixel: Array, patch: Array, chosen: Array) -> Array:
-    """Those of the points `kept` whose patch is chosen, (N,) int64.
-
-    kept: (M,) int64; pixel: (M,) int32, flat index of each; patch: (H, W) int32, labels of `connected_patches`; chosen:
-    (K,) bool, of each patch.
-    """
-    found = np.empty(len(kept), np.int64)
-    return found[: _in_patches(kept, pixel, patch.reshape(-1), chosen, found)]
-
-
-@kernel
-def _in_patches(kept, pixel, patch, chosen, found):
-    count = 0
-    for k in range(kept.size):
-        if chosen[patch[pixel[k]]]:
-            found[count] = kept[k]
-            count += 1
-    return count
-
-
-def in_patches_reference(kept: Array, pixel: Array, patch: Array, chosen: Array) -> Array:
-    """The same as `in_patches`, in plain numpy."""
-    return np.asarray(kept[chosen[patch.ravel()[pixel]]])
-
-
 def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) -> tuple[Array, Array]:
     """The same as `connected_patches`: scipy's connected components of the graph of links."""
     from scipy.sparse import coo_array  # takes long to import

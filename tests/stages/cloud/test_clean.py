@@ -11,12 +11,10 @@ from hypothesis import strategies as st
 
 from stages.cloud.clean import Clean
 from stages.cloud.kernels.depth_order import out_of_order, out_of_order_reference
-from stages.cloud.kernels.outliers import SupportRule, supported, supported_reference
+from stages.cloud.kernels.outliers import supported, supported_reference
 from stages.cloud.kernels.patches import (
     connected_patches,
     connected_patches_reference,
-    in_patches,
-    in_patches_reference,
 )
 from stages.cloud.reproject import Reproject
 from stages.data import LEVEL_FRAME, Array, PixelOrigin, PointCloud, Transform
@@ -138,17 +136,6 @@ def test_patch_kernel_equals_scipy_connected_components() -> None:
     np.testing.assert_array_equal(got[1], want[1])
 
 
-def test_selection_of_patches_equals_the_reference() -> None:
-    random = np.random.default_rng(9)
-    patch = random.integers(0, 8, (30, 40)).astype(np.int32)
-    pixel = np.flatnonzero(random.random(patch.size) < 0.5).astype(np.int32)
-    kept = np.sort(random.choice(5000, len(pixel), replace=False))
-    given = kept, pixel, patch, np.arange(8) % 3 == 0
-    got = in_patches(*given)
-    assert 0 < len(got) < len(kept)
-    np.testing.assert_array_equal(got, in_patches_reference(*given))
-
-
 def test_depth_order_kernel_equals_the_reference() -> None:
     random = np.random.default_rng(8)
     coarse = random.uniform(0.1, 0.5, (10, 12)).repeat(5, 0).repeat(5, 1)
@@ -192,8 +179,7 @@ def test_support_kernel_equals_the_reference() -> None:
     cloud, _ = with_floaters(cloud_with_noise(5), 0.05)
     random = np.random.default_rng(6)
     some = random.random(len(cloud.points)) < 0.4
-    rule = SupportRule(9.0, 3.0, 2.0, 0.3, 4)
-    arguments = cloud.points, cloud.sigma, cloud.pixel, np.flatnonzero(some), (480, 640), rule
+    arguments = cloud.points, cloud.sigma, cloud.pixel, np.flatnonzero(some), (480, 640), 9.0
     (got, inverse, _), want = supported(*arguments), supported_reference(*arguments)
     assert 0 < len(got) < some.sum()
     np.testing.assert_array_equal(np.flatnonzero(inverse > 0), np.sort(cloud.pixel[got]))
