@@ -21,13 +21,18 @@ F32 = np.float32
 UNLIMITED = 1e9  # px: the median replaces every match
 MIN_WEIGHT = 0.05  # WLS weight of a match, however low its confidence
 PLANE_CONFIDENCE, FILLED_CONFIDENCE = 0.8, 0.6  # not calibrated: the paper states none
+COMPACTNESS = 10.0  # SLIC's first weight of position against colour
+TRIALS = 100  # planes that RANSAC tries in a superpixel
+MIN_MATCHES, MIN_MATCHED_SHARE = 20, 0.2  # for a plane; the share is that of the mean superpixel
+WLS_LAMBDA, WLS_SIGMA = 8000.0, 1.0  # weight of smoothness; gray levels over which the coupling falls to 1/e
+MEASURED_WITHIN = 1.0  # px; largest correction of a match that stays MEASURED
 
 
 @dataclass(frozen=True)
 class RefinePaper(Stage):
     """RANSAC planes replace the matches of each superpixel, WLS fills the holes, and a bilateral filter smooths.
 
-    A match is MEASURED where its plane is within `measured_within`, else PLANE. A filled hole is FILLED.
+    A match is MEASURED where its plane is within 1 px, else PLANE. A filled hole is FILLED.
 
     References
     ----------
@@ -49,26 +54,11 @@ class RefinePaper(Stage):
     """
 
     superpixels: int = parameter(4000, "number of superpixels that SLIC aims at", low=1)
-    compactness: float = parameter(10.0, "SLIC's first weight of position against colour", low=0.01)
-    trials: int = parameter(100, "planes that RANSAC tries in a superpixel", low=1)
-    inlier_distance: float = parameter(
-        0.0,
-        "largest deviation of an inlier; 0: median absolute deviation of the superpixel's matches",
-        unit="px",
-        low=0,
-    )
-    min_matched_share: float = parameter(
-        0.2, "matches without which a superpixel gets no plane, as a share of the mean superpixel", low=0.0, high=1.0
-    )
-    min_matches: int = parameter(20, "matches without which a superpixel gets no plane", low=3)
-    wls_lambda: float = parameter(8000.0, "smoothness weight of WLS", low=0.0)
-    wls_sigma: float = parameter(1.0, "gray levels over which the coupling of WLS falls to 1/e", low=0.01)
     bilateral_radius: int = parameter(2, "radius of the bilateral filter; 0: none", unit="px", low=0, high=32)
     median_size: int = parameter(
         5, "median filter before the planes and at the end (authors' code, not in the text); 0: none", unit="px",
         choices=(0, 3, 5),
     )  # fmt: skip
-    measured_within: float = parameter(1.0, "largest correction of a match that stays MEASURED", unit="px", low=0.0)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         """Refine `disparity`, the left disparity of the rectified `frame`."""
@@ -90,7 +80,7 @@ class RefinePaper(Stage):
 
         channels = None if image.ndim == 2 else -1
         labels: Array = slic(  # in float32, which takes half the memory of skimage's own conversion
-            image / F32(255), n_segments=self.superpixels, compactness=self.compactness, slic_zero=True, start_label=0,
+            image / F32(255), n_segments=self.superpixels, compactness=COMPACTNESS, slic_zero=True, start_label=0,
             channel_axis=channels,
         )  # fmt: skip
         return labels.astype(np.int32)
@@ -101,7 +91,7 @@ class RefinePaper(Stage):
         known = np.flatnonzero(np.isfinite(matches))
         order = known[np.argsort(labels.ravel()[known], kind="stable")]
         sizes = np.bincount(labels.ravel()[known], minlength=labels.max() + 1)
-        enough = max(self.min_matches, self.min_matched_share * labels.size / (labels.max() + 1))
+        enough = max(MIN_MATCHES, MIN_MATCHED_SHARE * labels.size / (labels.max() + 1))
         for pixels in np.split(order, np.cumsum(sizes)[:-1]):
             if len(pixels) > enough:
                 y, x = np.divmod(pixels, labels.shape[1])
@@ -110,10 +100,13 @@ class RefinePaper(Stage):
         return planar
 
     def _plane(self, x: Array, y: Array, values: Array, random: np.random.Generator) -> Array:
-        """The values on the plane of most inliers among `trials` through three points each, refitted to its inliers."""
+        """The values on the plane of most inliers among `TRIALS` through three points each, refitted to its inliers.
+
+        An inlier deviates by at most the median absolute deviation of the superpixel's matches.
+        """
         points = np.stack([x, y, np.ones(len(x))])
-        limit = self.inlier_distance or np.median(np.abs(values - np.median(values)))
-        chosen = random.integers(0, len(x), (self.trials, 3))
+        limit = np.median(np.abs(values - np.median(values)))
+        chosen = random.integers(0, len(x), (TRIALS, 3))
         corners = points.T[chosen]
         proper = np.abs(np.linalg.det(corners)) > 0.5  # twice the area of the triangle, px^2: not on a line
         if not proper.any():
@@ -128,7 +121,7 @@ class RefinePaper(Stage):
         """The holes filled by confidence-weighted least squares, (H, W) float32; NaN where no evidence reaches."""
         hole = np.isnan(pixels)
         weights = np.where(hole, F32(0), np.maximum(confidence, F32(MIN_WEIGHT)))
-        return np.where(hole, smooth(pixels, weights, guide, self.wls_lambda, self.wls_sigma), pixels)
+        return np.where(hole, smooth(pixels, weights, guide, WLS_LAMBDA, WLS_SIGMA), pixels)
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
@@ -140,7 +133,7 @@ class RefinePaper(Stage):
 
     def _labelled(self, disparity: Disparity, matches: Array, refined: Array) -> tuple[Array, Array]:
         """Origin and confidence of each pixel; a pixel that stays unknown keeps its reason."""
-        near = np.abs(refined - matches) <= self.measured_within  # False where either is NaN
+        near = np.abs(refined - matches) <= MEASURED_WITHIN  # False where either is NaN
         plane = np.isfinite(matches) & ~near
         origin = np.select([near, plane], [PixelOrigin.MEASURED, PixelOrigin.PLANE], PixelOrigin.FILLED)
         trust = np.select([near, plane], [disparity.confidence, F32(PLANE_CONFIDENCE)], F32(FILLED_CONFIDENCE))
