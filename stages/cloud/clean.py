@@ -21,6 +21,9 @@ from stages.data import Array, PointCloud
 from stages.data.arrays import rows_of
 from stages.stage import Stage, parameter
 
+MIN_PATCH_SHARE = 5e-4  # organised: smaller isolated patches, as a share of the cloud, are dropped
+KNN_NEIGHBOURS = 20
+KNN_MAX_DEVIATIONS = 3.0  # of the mean distance to them, in standard deviations above the cloud's mean
 KNN_QUERY = 1 << 14  # points whose nearest neighbours are in memory at once
 
 
@@ -45,13 +48,6 @@ class Clean(Stage):
     method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
     max_range: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1, high=200.0)
     margin: float = parameter(1.0, "added to max_range for the crop around the camera", unit="m", low=0.0)
-    min_patch_share: float = parameter(
-        5e-4, "organised: smaller isolated patches, as a share of the cloud, are dropped", low=0.0, high=1.0
-    )
-    knn_neighbours: int = parameter(20, "knn: number of nearest neighbours", low=1)
-    knn_max_deviations: float = parameter(
-        3.0, "knn: largest mean distance to them, in standard deviations above the cloud's mean", low=0.0
-    )
 
     def __call__(self, cloud: PointCloud) -> PointCloud:
         """The near points of `cloud` that are no outliers, in their order; there may be none."""
@@ -89,7 +85,7 @@ class Clean(Stage):
         far = np.flatnonzero(measured & (cloud.points[:, 2] > self._crop))
         write_depths(cloud.points, cloud.sigma, cloud.pixel, far, math.inf, inverse, tolerance)
         patch, sizes = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
-        chosen = (sizes >= self.min_patch_share * len(kept)) & ~out_of_order(inverse, patch, sizes)
+        chosen = (sizes >= MIN_PATCH_SHARE * len(kept)) & ~out_of_order(inverse, patch, sizes)
         return kept[chosen.take(patch.ravel().take(cloud.pixel.take(kept)))]
 
     def _knn(self, cloud: PointCloud) -> Array:
@@ -98,12 +94,12 @@ class Clean(Stage):
 
         squares = np.einsum("ij,ij->i", cloud.points, cloud.points, dtype=np.float64)
         near = np.flatnonzero(squares <= self._crop**2)
-        if len(near) <= self.knn_neighbours:
+        if len(near) <= KNN_NEIGHBOURS:
             return near
         tree, mean = cKDTree(cloud.points[near]), np.empty(len(near))
         for first in range(0, len(near), KNN_QUERY):
             some = slice(first, first + KNN_QUERY)
-            distance, _ = tree.query(tree.data[some], k=self.knn_neighbours + 1, workers=1)
+            distance, _ = tree.query(tree.data[some], k=KNN_NEIGHBOURS + 1, workers=1)
             mean[some] = distance[:, 1:].mean(axis=1)
-        kept: Array = near[mean <= mean.mean() + self.knn_max_deviations * mean.std()]
+        kept: Array = near[mean <= mean.mean() + KNN_MAX_DEVIATIONS * mean.std()]
         return kept

@@ -33,7 +33,6 @@ class VoxelGrid(Stage):
     max_range: float = parameter(
         8.0, "horizontal range from the level frame's origin (base_link)", unit="m", low=0.1, high=200.0
     )
-    min_points: int = parameter(1, "voxels with fewer points are left out", low=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -46,5 +45,4 @@ class VoxelGrid(Stage):
         inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.max_range**2)
         points, colors = rows_of(cloud.points, inside), rows_of(cloud.colors, inside)
         index, count, colors = voxel_means(points, colors, self.resolution)
-        kept = count >= self.min_points
-        return VoxelMap(cloud.stamp, index[kept], colors[kept], count[kept], self.resolution, LEVEL_FRAME)
+        return VoxelMap(cloud.stamp, index, colors, count, self.resolution, LEVEL_FRAME)

@@ -12,9 +12,10 @@ import numpy as np
 
 from flow.contracts import Finding, Severity
 from stages.data import Disparity, MatchHealth, PixelOrigin
-from stages.stage import Stage, parameter
+from stages.stage import Stage
 
 NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
+MIN_MATCHED = 0.7  # share of the nearest ground, in the median of the frames
 
 
 @dataclass(frozen=True)
@@ -23,10 +24,6 @@ class CheckMatches(Stage):
 
     The nearest ground is in the lowest eighth of the rows.
     """
-
-    min_matched: float = parameter(
-        0.7, "share of the nearest ground that must be matched, in the median of the frames", low=0.0, high=1.0
-    )
 
     def start(self) -> list[float]:
         """The matched shares of the nearest ground, one for each frame of a run; none yet."""
@@ -42,8 +39,8 @@ class CheckMatches(Stage):
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 
     def finding(self, state: list[float]) -> Finding | None:
-        """A warning if the median of the frames is below `min_matched`."""
-        if not state or np.median(state) >= self.min_matched:
+        """A warning if the median of the frames is below `MIN_MATCHED`."""
+        if not state or np.median(state) >= MIN_MATCHED:
             return None
         return Finding(
             f"Only {100 * np.median(state):.0f} % of the nearest ground is matched, so the map is unreliable there. If "

@@ -63,9 +63,6 @@ class MatchOpenCV(Stage):
     lr_tolerance: int = parameter(1, "largest left-right difference", unit="px", low=1, high=64)
     max_speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0)
     speckle_range: int = parameter(1, "disparity step that separates patches", unit="px", low=1)
-    min_texture: float = parameter(
-        0.0, "mean horizontal gradient of a block, in gray levels, that a match must exceed", low=0, high=255
-    )
     color: bool = parameter(False, "match on RGB instead of gray")
 
     large = True  # StereoSGBM keeps the sums of all paths of the whole frame
@@ -84,7 +81,7 @@ class MatchOpenCV(Stage):
         check_rectified(self, frame)
         left, right = eight_bit(frame.left, frame.right)
         pixels, source = self._matched(*alike(left, right)) if self.color else self._matched(gray(left), gray(right))
-        bare = _texture(gray(left), self.block_size) <= self.min_texture
+        bare = _texture(gray(left), self.block_size) == 0
         pixels[bare], source[bare] = np.nan, PixelOrigin.BLANK
         return Disparity(frame.stamp, pixels, source, _agreement(pixels, np.isfinite(pixels)), camera=frame.camera)
 

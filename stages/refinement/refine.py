@@ -38,6 +38,8 @@ MAX_CORRECTION = 1.0  # px; a match farther from its median or plane stays as it
 MIN_INLIER_SHARE, MIN_VALID_SHARE = 0.8, 0.6  # of a superpixel with an accepted plane; a surface needs half the matches
 MAX_GRADIENT = 0.5  # px/px, of an accepted plane
 MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
+MAX_FILL_DISTANCE = 64.0  # px to a disparity that fills a hole; of an occlusion any distance
+MAX_EXTRAPOLATION = 16  # px that holes are filled beyond the last match, at the border or towards the sky
 DEPTH_EDGE = 1.0  # px between neighbours at an edge of depth
 EDGE_COLOUR = 15.0  # levels of colour over which a neighbour's weight falls to 1/e there
 # Fitted to eight Middlebury scenes and simulated frames, which count alike; tests/study.py prints the true shares.
@@ -96,12 +98,6 @@ class Refine(Stage):
     plane_weight: float = parameter(0.5, "weight of the plane against a match near it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: bool = parameter(True, "whether the remaining holes are filled from the background")
-    max_fill_distance: float = parameter(
-        64.0, "largest distance to a disparity that fills a hole (occlusions: any distance)", unit="px", low=0
-    )
-    max_extrapolation: int = parameter(
-        16, "how far holes are filled beyond the last match, at the border or towards the sky", unit="px", low=0
-    )
     bridge: bool = parameter(
         True, "whether a hole that both cameras see takes a line between its ends, where the images contradict its "
         "filling; ground has flanks, rooms have steps",
@@ -180,7 +176,7 @@ class Refine(Stage):
             return pixels, None, np.zeros(pixels.shape, bool)
         aimed = max(1, min(self.superpixels, pixels.size // self.min_superpixel_size))
         labels, count = superpixels(image, aimed, self.threads)
-        margin = self.max_extrapolation if self.plane_fill else -1
+        margin = MAX_EXTRAPOLATION if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
         accepted = self._accepted(planes, MIN_VALID_SHARE)
         pixels, agreed = pull_to_planes(
@@ -213,7 +209,7 @@ class Refine(Stage):
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
         if not self.fill:
             return pixels, np.where(np.isnan(pixels), np.uint8(OCCLUSION), np.uint8(KEPT))
-        found = fill_holes(pixels, image, within, self.max_fill_distance, self.max_extrapolation, self.threads)
+        found = fill_holes(pixels, image, within, MAX_FILL_DISTANCE, MAX_EXTRAPOLATION, self.threads)
         return bridge_holes(pixels, *found, guide, right, self.threads) if self.bridge else found
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:

@@ -22,6 +22,7 @@ from stages.terrain.kernels.nearest_known import nearest_known
 from stages.terrain.kernels.plane_window import window_planes
 
 SURROUNDINGS = 2.5  # m, width of the window in which an obstacle stands out
+MIN_SKIRT_HEIGHT = 0.05  # m; a cell this far off the ground belongs to the obstacle that it touches
 OBSTACLE_SHARE = 0.85  # of the rover's max_step, because cells blunt a peak
 # Largest variance of a plane's height at the cell, over one cell's: four cells. No ratio of small integers equals it,
 # so rounding does not decide. Under a wheel there are few cells, and only the slope counts.
@@ -61,9 +62,6 @@ class TerrainFeatures(Stage):
     """
 
     rover: Rover = parameter(Rover(), "the vehicle")
-    min_skirt_height: float = parameter(
-        0.05, "a cell this far off the ground belongs to the obstacle that it touches", unit="m", low=0.01
-    )
 
     @property
     def min_obstacle_height(self) -> float:
@@ -160,7 +158,7 @@ class TerrainFeatures(Stage):
             elevation.layers.get(name, elevation.layers["elevation"])[inside] for name in ("maximum", "minimum")
         )
         step = cell_steps(height, observed, top, bottom, lowest, level, trend)
-        raised = observed & ((np.abs(height - level) >= self.min_skirt_height) | (step >= self.min_obstacle_height))
+        raised = observed & ((np.abs(height - level) >= MIN_SKIRT_HEIGHT) | (step >= self.min_obstacle_height))
         return _as_whole_obstacles(step, raised), np.where(observed, support, np.nan)
 
 

@@ -97,13 +97,14 @@ def test_a_speck_of_nine_pixels_is_dropped_and_a_rock_is_kept() -> None:
     assert np.isin(np.flatnonzero(rock), pixels).mean() > 0.99
 
 
-def test_an_isolated_patch_of_a_hundred_pixels_is_dropped() -> None:
+def test_an_isolated_patch_of_a_hundred_pixels_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     d = seen_disparity()
     d[300:308, 100:112] *= 2
     cloud = Reproject()(blank_frame(), as_disparity(d))
     patch = (np.arange(300, 308)[:, None] * 640 + np.arange(100, 112)).ravel()
     assert not np.isin(patch, Clean()(cloud).pixel).any()
-    assert np.isin(patch[20:70], Clean(min_patch_share=0.0)(cloud).pixel).any()
+    monkeypatch.setattr("stages.cloud.clean.MIN_PATCH_SHARE", 0.0)
+    assert np.isin(patch[20:70], Clean()(cloud).pixel).any()
 
 
 @pytest.mark.parametrize("origin", [PixelOrigin.PLANE, PixelOrigin.FILLED])

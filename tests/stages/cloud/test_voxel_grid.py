@@ -54,7 +54,6 @@ def test_an_overhang_has_voxels_and_colours_of_its_own() -> None:
     assert voxels.index.tolist() == [[20, 20, 0], [20, 20, 20]]
     assert voxels.colors.tolist() == [[15, 25, 35], [200, 0, 0]]
     assert voxels.count.tolist() == [2, 1]
-    assert VoxelGrid(min_points=2)(cloud_of(points, colors)).count.tolist() == [2]
 
 
 def test_a_map_of_too_many_voxels_is_refused() -> None:

@@ -130,9 +130,10 @@ def test_a_disparity_beyond_the_image_is_no_match(box, bad):
     assert np.array_equal(refined.pixels, wanted.pixels, equal_nan=True)
 
 
-def test_nothing_is_invented_outside_the_right_image(box):
+def test_nothing_is_invented_outside_the_right_image(box, monkeypatch):
+    monkeypatch.setattr(module, "MAX_EXTRAPOLATION", 3)
     frame, matches, _ = box
-    refined = Refine(superpixels=200, min_superpixel_size=1, max_extrapolation=3)(frame, matches)
+    refined = Refine(superpixels=200, min_superpixel_size=1)(frame, matches)
     assert np.isnan(refined.pixels[:, :12]).all()
 
 
@@ -277,9 +278,9 @@ def test_occluded_pixels_never_get_the_occluders_disparity(box, monkeypatch):
 def test_nothing_is_filled_above_the_uppermost_matches():
     frame, pixels, source, confidence = flat_scene()
     pixels[:60, 30:130], source[:60, 30:130] = np.nan, 0  # a sky between two hills
-    refined = Refine(max_extrapolation=5)(frame, Disparity(5, pixels, source, confidence))
-    assert np.isnan(refined.pixels[:54, 46:114]).all()
-    assert np.isfinite(refined.pixels[56:, 30:130]).all()
+    refined = Refine()(frame, Disparity(5, pixels, source, confidence))
+    assert np.isnan(refined.pixels[:43, 46:114]).all()
+    assert np.isfinite(refined.pixels[45:, 30:130]).all()
 
 
 def test_matches_of_a_saturated_sky_do_not_count(monkeypatch):
@@ -290,7 +291,9 @@ def test_matches_of_a_saturated_sky_do_not_count(monkeypatch):
     image[:50] += noise
     pixels[:50] = 60
     sky = StereoFrame(5, image, image, frame.camera)
-    refined = Refine(max_extrapolation=5)(sky, Disparity(5, pixels, source, confidence))
+    with monkeypatch.context() as patched:
+        patched.setattr(module, "MAX_EXTRAPOLATION", 5)
+        refined = Refine()(sky, Disparity(5, pixels, source, confidence))
     assert (refined.source[:42] == PixelOrigin.SKY).all()
     assert np.isnan(refined.pixels[:42]).all()  # the last rows show the ground in their windows, and 5 px are margin
     assert (refined.pixels[50:] < 9).all()

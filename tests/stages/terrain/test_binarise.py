@@ -247,7 +247,7 @@ def test_noise_of_two_centimetres_is_no_hazard() -> None:
         assert (decided(map_of(noise, maximum=noise + 0.02, minimum=noise - 0.02)).cells == Cell.FREE).all()
 
 
-def test_the_low_back_of_a_rock_is_part_of_the_obstacle() -> None:
+def test_the_low_back_of_a_rock_is_part_of_the_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
     """A wide rock, 0.22 m high in front, whose back runs down to the ground over 0.8 m."""
     x, y = grid()
     rock = (x > 1.5) & (x < 2.3) & (np.abs(y - 2) < 0.5)
@@ -257,7 +257,8 @@ def test_the_low_back_of_a_rock_is_part_of_the_obstacle() -> None:
     scene = map_of(height + 0.08 * far + 0.04 * touching)
     back = rock & (height > 0.1) & (height < 0.15)
     whole = Binarise(hazard_margin=0.0)(TerrainFeatures()(scene))
-    peaks_only = Binarise(hazard_margin=0.0, rover=Rover(max_slope=1.0))(TerrainFeatures(min_skirt_height=1.0)(scene))
+    monkeypatch.setattr("stages.terrain.features.MIN_SKIRT_HEIGHT", 1.0)
+    peaks_only = Binarise(hazard_margin=0.0, rover=Rover(max_slope=1.0))(TerrainFeatures()(scene))
     assert (whole.reason[back] == CellReason.STEP).all()
     assert (whole.cells[rock & (height < 0.03)] == Cell.FREE).mean() > 0.9
     assert not (whole.reason[~rock] == CellReason.STEP).any()
