@@ -40,24 +40,6 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     assert refined["density"] > matched["density"]
 
 
-def test_each_scene_of_a_folder_becomes_a_log(tmp_path, said):
-    for name in ("Two", "One"):
-        write_scene(tmp_path / "trainingF" / name)
-    output = said(0, "import", "middlebury", tmp_path / "trainingF", tmp_path / "logs").out.splitlines()
-    logs = [tmp_path / "logs" / f"{name}.mcap" for name in ("One", "Two")]
-    assert [line.split(":")[0] for line in output] == [str(log) for log in logs]
-    assert sorted((tmp_path / "logs").iterdir()) == logs
-
-
-def test_a_broken_scene_does_not_stop_the_others(tmp_path, refused):
-    for name in ("One", "Two", "Three"):
-        write_scene(tmp_path / "scenes" / name)
-    (tmp_path / "scenes" / "One" / "disp0GT.pfm").write_bytes(b"spoilt")
-    why = refused("import", "middlebury", tmp_path / "scenes", tmp_path / "logs")
-    assert "1 of 3 scenes could not be imported" in why
-    assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["Three.mcap", "Two.mcap"]
-
-
 @pytest.mark.parametrize(
     ("spoilt", "out", "words"),
     [

@@ -306,7 +306,6 @@ def test_every_command_reports_an_unwritable_path_alike(traverse, result, tmp_pa
     for command in (
         ("run", traverse, *SMALL, "-o", "/proc/x.mcap", "--no-rrd"), ("simulate", "/proc/x.mcap", "--frames", 1),
         ("import", *images, "--height", 1), ("import", "middlebury", scene, "/proc/x.mcap"),
-        ("import", "middlebury", scene.parent, "/proc/x"),
         ("score", result, "--truth", traverse, "--json", "/proc/x.json"),
         ("export", result, "/proc/x"), ("demo", "--out", "/proc/x"), ("fleet", traverse, "--out", "/proc/x"),
         ("desk", tmp_path / "x.rrd", "--out", "/proc"),

@@ -84,26 +84,6 @@ def import_scene(folder: Path, out: Path) -> str:
     return f"1 stereo frame {content}; run it with --set disparities={scene.disparities}"
 
 
-def logs_of(source: Path, out: Path) -> list[tuple[Path, Path]]:
-    """(scene, log): `source` and `out` themselves, or each scene in the folder `source` with a log in the folder `out`.
-
-    Raises LogError if there is no scene, or `out` is not suitable.
-    """
-    if not source.is_dir():
-        raise LogError(f"{source} is not a folder; give a scene's folder, or a folder of scenes")
-    if _is_scene(source):
-        return [(source, out)]
-    scenes = sorted(folder for folder in source.iterdir() if folder.is_dir() and _is_scene(folder))
-    if not scenes:
-        raise LogError(f"neither {source} nor a folder in it contains a scene ({', '.join((*IMAGES, CALIBRATION))})")
-    if out.suffix == ".mcap" or (out.exists() and not out.is_dir()):
-        raise LogError(
-            f"{source} contains several scenes, and each becomes a log of its own; give a folder for the logs "
-            f"instead of {out}"
-        )
-    return [(folder, out / f"{folder.name}.mcap") for folder in scenes]
-
-
 def read_scene(folder: Path | str, stamp: int = FIRST_STAMP) -> MiddleburyScene:
     """The scene of a folder, with its frame at `stamp`, ns. Raises LogError if a file is missing (the truth may be) or
     cannot be used."""
@@ -139,10 +119,6 @@ def read_pfm(path: Path) -> Array:
     if not np.isfinite(rows).any():
         raise LogError(f"{path} has no known pixel; get it again")
     return np.where(np.isfinite(rows), rows, np.nan).astype(np.float32)[::-1].copy()
-
-
-def _is_scene(folder: Path) -> bool:
-    return any((folder / name).exists() for name in (IMAGES[0], CALIBRATION))
 
 
 def _calibration(path: Path) -> tuple[dict[str, str], dict[str, float]]:

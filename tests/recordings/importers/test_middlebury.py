@@ -10,7 +10,7 @@ import pytest
 from mcap.reader import make_reader
 
 from recordings.errors import LogError
-from recordings.importers.middlebury import import_scene, logs_of, read_pfm, read_scene
+from recordings.importers.middlebury import import_scene, read_pfm, read_scene
 from recordings.importers.recording import FIRST_STAMP
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
@@ -83,15 +83,9 @@ def test_the_truth_is_that_of_the_scene(tmp_path):
 
 
 def test_either_name_of_the_truth_is_read(tmp_path):
-    source = tmp_path / "trainingH"
-    for name in ("Vintage", "Adirondack-perfect"):
-        scene = write_scene(source / name)
-        (scene / "disp0GT.pfm").rename(scene / "disp0.pfm")
-    (source / "notes").mkdir()
-    made = logs_of(source, tmp_path / "logs")
-    assert [folder.name for folder, _ in made] == ["Adirondack-perfect", "Vintage"]
-    assert [log for _, log in made] == [tmp_path / "logs" / f"{n}.mcap" for n in ("Adirondack-perfect", "Vintage")]
-    np.testing.assert_array_equal(np.isfinite(read_scene(made[0][0]).truth), np.isfinite(scenes.true_disparity()))
+    scene = write_scene(tmp_path / "Vintage")
+    (scene / "disp0GT.pfm").rename(scene / "disp0.pfm")
+    np.testing.assert_array_equal(np.isfinite(read_scene(scene).truth), np.isfinite(scenes.true_disparity()))
 
 
 @pytest.mark.parametrize(
@@ -167,17 +161,6 @@ def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path, damage, words):
         imported(folder)
     assert "\n" not in str(caught.value)
     assert [path.name for path in tmp_path.iterdir()] == ["Box"]
-
-
-def test_folders_without_scenes_and_files_for_several_logs_are_refused(tmp_path):
-    write_scene(tmp_path / "training" / "Box")
-    for out in (tmp_path / "out.mcap", tmp_path / "training" / "Box" / "im0.png"):
-        with pytest.raises(LogError, match="give a folder for the logs instead of"):
-            logs_of(tmp_path / "training", out)
-    with pytest.raises(LogError, match="contains a scene"):
-        logs_of(tmp_path, tmp_path / "logs")
-    with pytest.raises(LogError, match="is not a folder"):
-        logs_of(tmp_path / "nowhere", tmp_path / "logs")
 
 
 def test_real_scenes_score_from_their_logs_as_from_their_files(tmp_path):
