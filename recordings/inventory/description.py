@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flow.contracts import counted
 from recordings.containers.container import LostMessage
 from recordings.inventory.search_range import search_range
 from recordings.scoring.result_log import about_run, pipeline_of
@@ -19,28 +19,24 @@ from recordings.source.log import McapLog
 from stages.data import StereoCamera, Tilt
 
 MAX_VERIFIED_BYTES = 300_000_000  # of a log whose messages are all read; it takes a second
-MAX_SENTENCES = 20_000  # about damage; there may be millions
 Stamps = NDArray[np.int64]
 
 
-@dataclass
-class Damage:
-    """Sentences about damage, the first ones of many. left_out: the number of the others."""
+class Damage(dict[str, tuple[int, str]]):
+    """Sentences about damage: without the numbers of single messages -> how many are alike, and the first of them."""
 
-    sentences: list[str]
-    left_out: int = 0
-
-    def append(self, sentence: str) -> None:
+    def add(self, sentence: str) -> None:
         """Add a sentence."""
-        if len(self.sentences) < MAX_SENTENCES:
-            self.sentences.append(sentence)
-        else:
-            self.left_out += 1
+        if not re.search(r" at \d+ ns\b", sentence):  # of the log
+            self[sentence] = 1, sentence
+            return
+        alike = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", sentence)
+        count, first = self.get(alike, (0, sentence))
+        self[alike] = count + 1, first
 
     def listed(self) -> list[str]:
-        """The distinct sentences."""
-        more = [f"{counted(self.left_out, 'more message')} cannot be read"] if self.left_out else []
-        return [*dict.fromkeys(self.sentences), *more]
+        """A sentence for each kind of damage."""
+        return [f"{count} similar, first: {first}" if count > 1 else first for count, first in self.values()]
 
 
 def describe(
@@ -53,7 +49,9 @@ def describe(
     ns, to the largest one around a frame; None: do not count frames with a tilt.
     """
     resolution, lost = log.resolution, log.file.lost
-    damage = Damage(sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems}))
+    damage = Damage()
+    for sentence in sorted({item.reason for item in lost} | {str(problem) for _, problem in resolution.problems}):
+        damage.add(sentence)
     delays, of_tilts = array("q"), array("q")
     stamps = {stream: _stamps(log, stream, damage, delays if stream == "left" else None) for stream in CAMERAS}
     stamps["inclinometer"] = _tilts(log, damage, of_tilts)
@@ -137,7 +135,7 @@ def _stamps(log: McapLog, stream: str, damage: Damage, delays: array[int] | None
             if delays is not None:
                 delays.append(raw.log_time - stamps[-1])
         elif raw.channel is not None:
-            damage.append(f"{topic} at {raw.log_time} ns: {raw.reason}")
+            damage.add(f"{topic} at {raw.log_time} ns: {raw.reason}")
     return np.asarray(stamps, np.int64)
 
 
@@ -154,7 +152,7 @@ def _tilts(log: McapLog, damage: Damage, delays: array[int]) -> Stamps:
             stamps.append(item.stamp)
             delays.append(log_time - item.stamp)
         elif stream == "inclinometer":
-            damage.append(str(item))
+            damage.add(str(item))
     return np.asarray(stamps, np.int64)
 
 
@@ -168,7 +166,7 @@ def _distinct(log: McapLog, stream: str, damage: Damage, stamps: Stamps) -> Stam
     distinct = np.unique(stamps)
     if repeated := len(stamps) - distinct.size:
         what = f"{repeated} of {len(stamps)} messages repeat a stamp; a run drops them"
-        damage.sentences.append(f"{log.topics[stream]}: {what}")
+        damage.add(f"{log.topics[stream]}: {what}")
     return distinct
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 from flow.contracts import counted
@@ -54,7 +53,7 @@ def format_description(description: dict[str, Any]) -> str:
         lines.append(f"missing: {streams}: {why.removesuffix(f': {known}')}")
     lines += [f"note: {stream}: {note}" for stream, note in d["notes"].items()]
     lines += [d["undecodable"]] if d["undecodable"] and d["undecodable"] not in d.get("refused", "") else []
-    lines += [f"damaged: {damage}" for damage in _grouped(d["damage"])]
+    lines += [f"damaged: {damage}" for damage in d["damage"]]
     return "\n".join(lines)
 
 
@@ -86,12 +85,3 @@ def _frame_line(frames: dict[str, Any]) -> str:
         least, median, most = (format(scale * delay, form) for delay in frames["delay_s"])
         line += f"; left images were logged {median} {unit} after their stamps ({least} to {most} {unit})"
     return line
-
-
-def _grouped(damage: list[str]) -> list[str]:
-    """The sentences; those about single messages that differ only in numbers are counted."""
-    groups: dict[str, list[str]] = {}
-    for what in damage:
-        pattern = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", what) if re.search(r" at \d+ ns\b", what) else what
-        groups.setdefault(pattern, []).append(what)
-    return [f"{len(same)} similar, first: {same[0]}" if len(same) > 1 else same[0] for same in groups.values()]

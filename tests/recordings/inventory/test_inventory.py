@@ -110,7 +110,6 @@ def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path):
     zero = changed(TILT, {f"orientation.{name}": 0.0 for name in "xyzw"}, range(1, FRAMES))
     other = changed(TILT, {"orientation.w": 0.25}, range(3, FRAMES))
     described = inventory_of(write_sample(tmp_path / "log.mcap", zero, other))
-    assert len(described["damage"]) == FRAMES - 1
     (line,) = (line for line in format_description(described).splitlines() if line.startswith("damaged"))
     assert line.startswith(
         f"damaged: 4 similar, first: {TILT} at {START + PERIOD} ns: the quaternion of the inclinometer"
