@@ -51,7 +51,7 @@ def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(sample, who
     }
     description = inventory_of(path)
     assert description["frames"]["pairs"] == FIRST
-    assert f"{LEFT} at {images[0][0]} ns: {sentence}" in description["damage"]
+    assert f"{LEFT} at {images[0][0]} ns: {sentence}" in " ".join(description["damage"])
 
 
 @EVERY_LAYOUT
