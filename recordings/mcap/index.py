@@ -16,14 +16,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
-from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.finding import first_bytes
@@ -78,14 +76,6 @@ class Index:
         if log_time <= MAX_LOG_TIME:
             self.latest = max(self.latest, log_time)
         return len(self.counted_times) - 1
-
-    def count_messages(self, channels: NDArray[np.uint16], log_times: NDArray[np.uint64]) -> int:
-        """Count the next messages of the file; returns the place of the first."""
-        first = len(self.counted_times)
-        self.counted_channels.frombytes(channels.tobytes())
-        self.counted_times.frombytes(log_times.tobytes())
-        self.latest = max(self.latest, int(np.max(log_times, where=log_times <= MAX_LOG_TIME, initial=0)))
-        return first
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Store a schema or a channel; other records are ignored."""

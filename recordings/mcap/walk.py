@@ -11,7 +11,6 @@ import struct
 from contextlib import suppress
 from typing import BinaryIO
 
-import numpy as np
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import ChunkIndex
@@ -46,9 +45,6 @@ _MAX_READ_BYTES = {Opcode.CHUNK: MAX_CHUNK_BYTES, Opcode.MESSAGE: MESSAGE.size, 
 _MAX_RECORD_BYTES = 1 << 24  # of any other record
 _MAX_RESCUE_BYTES = 1 << 26  # of what may have been a chunk
 _BLOCK_BYTES = 1 << 20
-_MIN_ALIKE = 8  # messages of one length that are read together
-_HEAD_FIELDS, _HEAD_TYPES = ["opcode", "length", "channel", "log_time"], ["u1", "<u8", "<u2", "<u8"]
-_HEAD_OFFSETS = [0, 1, RECORD.size, RECORD.size + 6]  # of these fields in a message record
 
 
 def walk(file: BinaryIO, size: int) -> Index:
@@ -126,32 +122,9 @@ def _note_messages(index: Index, block: bytes, position: int) -> int:
         end = at + RECORD.size + length
         if opcode != Opcode.MESSAGE or length < MESSAGE.size or end > len(block):
             break
-        later = at + _MIN_ALIKE * (end - at)
-        if block[later : later + RECORD.size] == block[at : at + RECORD.size]:
-            at += _note_alike(index, block, position, at, length)
-        else:
-            _note_message(index, block, position + at, length, at + RECORD.size)
-            at = end
+        _note_message(index, block, position + at, length, at + RECORD.size)
+        at = end
     return at
-
-
-def _note_alike(index: Index, block: bytes, position: int, at: int, length: int) -> int:
-    """Note the message at `at` in a block and those of the same length that follow it; returns that of their records.
-
-    The same as `_note_message` for each, in a fraction of the time.
-    """
-    step = RECORD.size + length
-    head = np.dtype({"names": _HEAD_FIELDS, "formats": _HEAD_TYPES, "offsets": _HEAD_OFFSETS, "itemsize": step})
-    records = np.frombuffer(block, head, (len(block) - at) // step, at)
-    other = (records["opcode"] != Opcode.MESSAGE) | (records["length"] != length)
-    count = int(np.argmax(other)) if other.any() else len(records)
-    places, offsets, sizes = index.unchunked
-    first = index.count_messages(records["channel"][:count], records["log_time"][:count])
-    numbers = np.arange(count, dtype=np.uint64)
-    places.frombytes(np.arange(first, first + count, dtype=np.uint32).tobytes())
-    offsets.frombytes((numbers * np.uint64(step) + np.uint64(position + at + RECORD.size + MESSAGE.size)).tobytes())
-    sizes.frombytes(np.full(count, length - MESSAGE.size, np.uint32).tobytes())
-    return count * step
 
 
 def _note_message(index: Index, content: bytes, position: int, length: int, start: int = 0) -> None:

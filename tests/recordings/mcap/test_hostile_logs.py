@@ -18,9 +18,8 @@ from rosbags.rosbag2 import StoragePlugin
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.mcap import chunk, message_order, walk
+from recordings.mcap import chunk, message_order
 from recordings.mcap.file import McapFile
-from recordings.mcap.index import MESSAGE
 from tests.conftest import Extra, rewrite
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
@@ -258,22 +257,6 @@ def test_a_topic_faster_than_any_sensor_is_refused_unless_a_setting_allows_it(tm
         assert "set 'max_rate' of the source to the rate of the sensor" in log.missing["inclinometer"]
     with McapSource(max_rate=3).open(path) as log:
         assert sound(log.events()) == essences(whole)
-
-
-@pytest.mark.parametrize("cut", [0, 2000, 2020])
-def test_messages_outside_chunks_are_noted_together_as_one_by_one(tmp_path, monkeypatch, cut):
-    path = with_extra(lambda *to: many_messages(*to, 30), use_chunking=False)(tmp_path)
-    data = bytearray(path.read_bytes()[: path.stat().st_size - cut])
-    last = data.rindex(NOTHING) - MESSAGE.size
-    data[last + 6 : last + 14] = bytes([255] * 8)  # a damaged log time
-    path.write_bytes(data)
-    found = []
-    for alike in (2, 8, 1 << 40):
-        monkeypatch.setattr(walk, "_MIN_ALIKE", alike)
-        with path.open("rb") as file:
-            found.append(vars(walk.walk(file, len(data))))
-    assert found[0] == found[1] == found[2]
-    assert len(found[0]["counted_times"]) > 30
 
 
 def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tmp_path, monkeypatch):
