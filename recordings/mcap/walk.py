@@ -39,6 +39,7 @@ from recordings.mcap.index import (
     read_at,
     read_summary,
 )
+from recordings.mcap.message_order import ChunkTable
 
 _MIN_PRIVATE_OPCODE = 0x80
 _MAX_READ_BYTES = {Opcode.CHUNK: MAX_CHUNK_BYTES, Opcode.MESSAGE: MESSAGE.size, Opcode.ATTACHMENT: 0}  # of a record
@@ -139,28 +140,24 @@ def _note_message(index: Index, content: bytes, position: int, length: int, star
 def _note_chunk(index: Index, content: bytes, position: int) -> None:
     try:
         records = unpack_chunk(content)
-        for _ in iter_records(records):  # a chunk with a cut record is broken as a whole
-            pass
+        table = ChunkTable(records)  # a chunk with a cut record is broken as a whole
     except PARSE_ERRORS as error:
         index.note_damage(lost_chunk(position, error), chunk_start_time(content))
         return
-    offsets, times, first = {}, [], len(index.counted_times)
     for opcode, record in iter_records(records):
-        if opcode == Opcode.MESSAGE:
-            channel, _, log_time, _ = MESSAGE.unpack_from(record)
-            offsets[channel] = 0
-            times.append(log_time)
+        index.define(opcode, record)
+    if table.times:
+        first = len(index.counted_times)
+        for channel, log_time in zip(table.channels, table.times, strict=True):
             index.count_message(channel, log_time)
-        else:
-            index.define(opcode, record)
-    if times:
         chunk = ChunkIndex(
             chunk_length=RECORD.size + len(content), chunk_start_offset=position, compression="", compressed_size=0,
-            message_end_time=max(times), message_index_length=0, message_index_offsets=offsets,
-            message_start_time=min(times), uncompressed_size=len(records),
+            message_end_time=max(table.times), message_index_length=0,
+            message_index_offsets=dict.fromkeys(table.channels, 0), message_start_time=min(table.times),
+            uncompressed_size=len(records),
         )  # fmt: skip
         index.chunks.append(chunk)
-        index.places[position] = range(first, first + len(times))
+        index.places[position] = range(first, len(index.counted_times))
 
 
 def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:
