@@ -6,8 +6,6 @@ Then the file is walked through, and every chunk is unpacked once to find its me
 
 from __future__ import annotations
 
-import re
-import struct
 from array import array
 from collections import defaultdict
 from collections.abc import Callable
@@ -15,7 +13,7 @@ from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,9 +26,7 @@ from recordings.mcap.chunk import MAX_CHUNK_BYTES
 
 _LISTED = np.dtype([("seconds", "<u4"), ("rest", "<u4"), ("offset", "<u4")])  # a message in an index record
 _ENTRY = np.dtype([("offset", "<u4"), ("connection", "<u4"), ("time", "<i8")])
-_UINT32, _TIME = struct.Struct("<I"), struct.Struct("<II")
-_CONNECTION_FIELD, _TIME_FIELD = b"\x09\0\0\0conn=", b"\x0d\0\0\0time="  # each with its length before it
-_MAX_LAYOUTS, _MAX_CONNECTIONS = 8, 10_000  # a recorder writes one layout
+_MAX_CONNECTIONS = 10_000
 _FIRST_RECORD = 13  # after the line with the version
 
 
@@ -41,7 +37,7 @@ class BagIndex(Reader):
         super().__init__(path)
         self._entries = defaultdict[int, list[NDArray[Any]]](list)  # by the place of the chunk
         self._count = 0
-        self._known, self._layouts = set[int](), list[_Layout]()  # of a walk: connections, and headers of messages
+        self._known = set[int]()  # connections that a walk has found
 
     def read_index_data(self, pos: int, indexes: dict[int, list[Any]]) -> None:
         """Read the index record of a connection in a chunk."""
@@ -86,47 +82,31 @@ class BagIndex(Reader):
         if isinstance(records, str):
             return records
         offsets, connections, times, why = array("I"), array("I"), array("q"), ""
-        layout, offset = _Layout(re.compile(b"(?!)"), 0, 0, 0), 0  # like no header
+        stream, offset = BytesIO(records), 0
         try:
-            while offset < len(records):
-                if not layout.header.match(records, offset):
-                    found = self._layout_at(records, offset)
-                    if isinstance(found, int):
-                        offset = found
-                        continue
-                    layout = found
-                (size,) = _UINT32.unpack_from(records, offset + layout.size)
-                seconds, rest = _TIME.unpack_from(records, offset + layout.time)
-                offsets.append(offset)
-                connections.extend(_UINT32.unpack_from(records, offset + layout.connection))
-                times.append(seconds * 1_000_000_000 + rest)
-                offset += layout.size + _UINT32.size + size
+            while (offset := stream.tell()) < len(records):
+                header = Header.read(stream)
+                number = header.get_uint32("conn")
+                if header.get_uint8("op") == RecordType.MSGDATA:
+                    times.append(header.get_time("time"))
+                    offsets.append(offset)
+                    connections.append(number)
+                elif number not in self._known:
+                    self._add_connection(stream, offset, number)
+                    continue
+                stream.seek(read_uint32(stream), 1)
         except Exception as error:  # foreign bytes may fail the reader in any way
             why = f"the chunk at byte {position} is broken at its byte {offset} ({sentence_of(error).rstrip('.')})"
         self._add(position, offsets, connections, times)
         return why
 
-    def _layout_at(self, records: bytes, offset: int) -> _Layout | int:
-        """The layout of the message at an offset in a chunk; where a connection is there, the offset after it."""
-        for layout in self._layouts:
-            if layout.header.match(records, offset):
-                return layout
-        stream = BytesIO(records)
-        stream.seek(offset)
-        header = Header.read(stream)
-        if header.get_uint8("op") == RecordType.MSGDATA:
-            if len(self._layouts) == _MAX_LAYOUTS:
-                raise ReaderError(f"its messages have over {_MAX_LAYOUTS} kinds of headers")
-            self._layouts.append(_layout_of(records[offset : stream.tell()]))
-            return self._layouts[-1]
-        if (number := header.get_uint32("conn")) in self._known:
-            return stream.seek(read_uint32(stream), 1)
+    def _add_connection(self, stream: BytesIO, offset: int, number: int) -> None:
+        """Read the connection at an offset in a chunk, so that the stream is after it."""
         if len(self._known) == _MAX_CONNECTIONS:
             raise ReaderError(f"the bag has over {_MAX_CONNECTIONS} connections")
         stream.seek(offset)
         self.connections.append(Reader.read_connection(cast(Any, SimpleNamespace(bio=stream))))
         self._known.add(number)
-        return stream.tell()
 
     def _add(self, chunk: int, offsets: ArrayLike, connections: ArrayLike, times: ArrayLike) -> None:
         entries = np.empty(np.shape(offsets), _ENTRY)
@@ -159,22 +139,3 @@ class BagIndex(Reader):
     def places(self) -> list[int]:
         """The places of the chunks with messages, in the file, ascending."""
         return sorted(self._entries)
-
-
-class _Layout(NamedTuple):
-    """The header of a message: what it looks like, where its connection and its time are, and its size."""
-
-    header: re.Pattern[bytes]
-    connection: int
-    time: int
-    size: int
-
-
-def _layout_of(header: bytes) -> _Layout:
-    """The layout of the header of a message, as other messages of the bag have it."""
-    connection, time = (header.index(field) + len(field) for field in (_CONNECTION_FIELD, _TIME_FIELD))
-    values = sorted([(connection, _UINT32.size), (time, _TIME.size)])
-    pattern, end = b"", 0
-    for start, size in values:
-        pattern, end = pattern + re.escape(header[end:start]) + b".{%d}" % size, start + size
-    return _Layout(re.compile(pattern + re.escape(header[end:]), re.DOTALL), connection, time, len(header))
