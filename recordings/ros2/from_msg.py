@@ -1,4 +1,4 @@
-"""Data from ROS 2 messages: calibrations, transforms and poses, and readers of what `to_msg` writes.
+"""Data from ROS 2 messages: calibrations, transforms and poses, and readers of exactly what `to_msg` writes.
 
 The functions raise LogError for a message with invalid content.
 """
@@ -128,9 +128,7 @@ def read_disparity(message: Any) -> NDArray[np.float32]:
     picture = message.image
     if picture.encoding != "32FC1":
         raise ValueError(f"a disparity image must be 32FC1, not {picture.encoding}")
-    order = ">" if picture.is_bigendian else "<"
-    rows = np.asarray(picture.data, dtype=np.uint8).reshape(picture.height, picture.step)
-    return np.ascontiguousarray(rows[:, : 4 * picture.width]).view(f"{order}f4").astype(np.float32)
+    return np.array(picture.data, np.uint8).view(np.float32).reshape(picture.height, picture.width)
 
 
 def read_point_cloud(message: Any) -> dict[str, Array]:
@@ -140,25 +138,17 @@ def read_point_cloud(message: Any) -> dict[str, Array]:
     """
     if any(known.datatype != FLOAT32 or known.count != 1 for known in message.fields):
         raise ValueError("a point cloud must have fields of one float32 each")
-    order, names = ">" if message.is_bigendian else "<", [known.name for known in message.fields]
-    layout = {
-        "names": names, "formats": [f"{order}f4"] * len(names), "offsets": [known.offset for known in message.fields],
-        "itemsize": message.point_step,
-    }  # fmt: skip
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.row_step)
-    packed = np.ascontiguousarray(rows[:, : message.width * message.point_step]).view(np.dtype(layout)).reshape(-1)  # type: ignore[call-overload]
-    fields: dict[str, Array] = {name: packed[name].astype(np.float32) for name in names if name != "rgb"}
+    names = [known.name for known in message.fields]
+    points = np.array(message.data, np.uint8).view(np.float32).reshape(message.width, len(names))
+    fields: dict[str, Array] = {name: points[:, n].copy() for n, name in enumerate(names) if name != "rgb"}
     if "rgb" in names:
-        bits = np.ascontiguousarray(packed["rgb"]).view(f"{order}u4")
+        bits = points[:, names.index("rgb")].copy().view(np.uint32)
         fields["colors"] = np.stack([bits >> shift & 0xFF for shift in (16, 8, 0)], axis=1).astype(np.uint8)
     return fields
 
 
 def read_grid_map(message: Any) -> ElevationMap:
-    """All layers of an axis-aligned grid_map_msgs/GridMap with a layer "elevation".
-
-    A map with start indices in its circular buffer is unrolled. Raises ValueError if a layer is not column-major.
-    """
+    """All layers of a grid_map_msgs/GridMap with a layer "elevation"."""
     info, centre = message.info, message.info.pose.position
     return ElevationMap(
         stamp_of(message.header), read_layers(message), float(info.resolution),
@@ -171,12 +161,8 @@ def read_layers(message: Any) -> dict[str, Array]:
     layers = {}
     for name, array in zip(message.layers, message.data, strict=True):
         outer, inner = array.layout.dim
-        if outer.label != "column_index":
-            raise ValueError(f"grid map layer '{name}' is stored by {outer.label}, not column-major")
-        stored = np.asarray(array.data, np.float32)[array.layout.data_offset :].reshape(outer.size, inner.size)
-        # outer_start_index counts along the matrix' first index (-x), inner_start_index along its second (-y).
-        unrolled = np.roll(stored, (-message.inner_start_index, -message.outer_start_index), axis=(0, 1))
-        layers[name] = np.ascontiguousarray(unrolled[::-1, ::-1])
+        stored = np.asarray(array.data, np.float32).reshape(outer.size, inner.size)
+        layers[name] = np.ascontiguousarray(stored[::-1, ::-1])
     return layers
 
 

@@ -157,19 +157,11 @@ def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y():
             np.testing.assert_equal(matrix[i, j], ours.layers["count"][row, col])
 
 
-@given(
-    st.integers(1, 7), st.integers(1, 7), st.floats(0.01, 2.0), st.floats(-50, 50), st.integers(0, 6), st.integers(0, 6)
-)
-def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x, outer, inner):
+@given(st.integers(1, 7), st.integers(1, 7), st.floats(0.01, 2.0), st.floats(-50, 50))
+def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x):
     layer = np.random.default_rng(rows * 10 + cols).normal(size=(rows, cols)).astype(np.float32)
     ours = ElevationMap(STAMP, {"elevation": layer}, cell, (x, -x / 3), "odom")
-    message = grid_map(ours)
-    # A map moved in its circular buffer: its cell (0, 0) stands at the start indices.
-    message.outer_start_index, message.inner_start_index = outer % cols, inner % rows
-    matrix = message.data[0].data.reshape((cols, rows), order="F")
-    rolled = np.roll(matrix, (outer % cols, inner % rows), (0, 1))
-    message.data[0].data = np.ascontiguousarray(rolled.T).reshape(-1)
-    back = read_grid_map(message)
+    back = read_grid_map(grid_map(ours))
     np.testing.assert_array_equal(back.layers["elevation"], layer)
     np.testing.assert_allclose(back.origin, ours.origin, atol=1e-9)
     assert (back.resolution, back.frame_id, back.stamp) == (cell, "odom", STAMP)
@@ -363,20 +355,16 @@ def test_messages_of_real_recorders_are_decoded():
     assert sum(1 for _ in iter_decoded(cdr)) == 7
 
 
-def test_a_point_cloud_is_read_with_padding_and_either_byte_order():
+def test_a_point_cloud_is_read_back_unchanged():
     rng = np.random.default_rng(3)
     points, colors = rng.normal(size=(7, 3)).astype(np.float32), rng.integers(0, 256, (7, 3), dtype=np.uint8)
     points[2] = np.nan
     sigma = rng.uniform(0.01, 0.2, 7).astype(np.float32)
     message = point_cloud(PointCloud(5, points, colors, sigma, np.arange(7, dtype=np.int32), "level"))
-    padded = np.zeros((7, 28), np.uint8)
-    padded[:, :20] = message.data.reshape(7, 5, 4)[:, :, ::-1].reshape(7, 20)
-    other = replace(message, data=padded.reshape(-1), point_step=28, row_step=28 * 7, is_bigendian=True)
-    for sent in (message, other):
-        read = read_point_cloud(sent)
-        np.testing.assert_array_equal(np.column_stack([read[name] for name in "xyz"]), points)
-        np.testing.assert_array_equal(read["colors"], colors)
-        np.testing.assert_array_equal(read["sigma"], sigma)
+    read = read_point_cloud(message)
+    np.testing.assert_array_equal(np.column_stack([read[name] for name in "xyz"]), points)
+    np.testing.assert_array_equal(read["colors"], colors)
+    np.testing.assert_array_equal(read["sigma"], sigma)
     with pytest.raises(ValueError, match="fields of one float32 each"):
         read_point_cloud(replace(message, fields=[replace(message.fields[0], datatype=8), *message.fields[1:]]))
 
