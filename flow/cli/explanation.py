@@ -17,7 +17,6 @@ import numpy as np
 
 from flow.cli.instants import Instant, no_frame, part_of
 from flow.cli.replay import one_thread_per_call
-from flow.cli.report import say
 from flow.cli.result_input import graph_of, input_of
 from flow.contracts import FrameRecord
 from flow.errors import UsageError
@@ -255,8 +254,6 @@ def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
     kept = _Keep()
     with one_thread_per_call():
         part = part_of(log, at, frames=1, before=0)
-        if part.note:
-            say(f"note: {part.note}")
         log.narrow(part.start, part.end)
         summary = run(replace(graph, sinks=(("keep", kept),)), log, {"keep": Path("memory")})
     if not kept.records:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 DAY = 86_400_000_000_000  # ns
 MARGIN = 1_000_000_000  # ns before the first and after the last image of a log
+ROUNDING = 100_000_000  # ns, of an instant as a user gives it
 Instant = float | np.datetime64 | np.timedelta64
 
 
@@ -27,7 +28,7 @@ class Part:
 
     start, end: the part to read; first: where it would begin without the frames before the instant; at, stamp: the
     first frame of the instant, in s and as its stamp, ns; frames, before: numbers of left images from the instant on
-    and before it; note: why that frame is not at the instant, else empty.
+    and before it.
     """
 
     start: float
@@ -37,11 +38,10 @@ class Part:
     before: int
     stamp: int
     first: float
-    note: str
 
 
 def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64) -> Part:
-    """The left images nearest to an instant, and those before them; raises UsageError.
+    """The left images nearest to an instant, and those before them; raises UsageError for one outside the images.
 
     at: s after the log's first message; or a stamp; or the time of the day, UTC, of one; before: their number, or the
     stamp of the first of them.
@@ -50,18 +50,15 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     if not times.size:
         raise UsageError(f"{log.path} has no left images")
     chosen = _nearest(log, times, at)
-    if chosen is None:
+    time, stamp = int(times[chosen]), _stamp(log, times, chosen)
+    off = _ns(log, at) - (time if isinstance(at, float | int) else stamp)
+    if (chosen == 0 and off < -ROUNDING) or (chosen == times.size - 1 and off > ROUNDING):
         raise UsageError(_outside(log, times, at))
-    earlier = chosen - (_nearest(log, times, before) or 0) if isinstance(before, np.datetime64) else before
+    earlier = chosen - _nearest(log, times, before) if isinstance(before, np.datetime64) else before
     low, high = max(0, chosen - earlier), min(times.size, chosen + frames) - 1
     edges = np.concatenate([times[:1] - MARGIN, (times[1:] + times[:-1]) // 2, times[-1:] + MARGIN])
     start, first, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, chosen, high + 1))
-    time, stamp = int(times[chosen]), _stamp(log, times, chosen)
-    off = _ns(log, at) - (time if isinstance(at, float | int) else stamp)
-    half = int(np.median(np.diff(times))) // 2 if times.size > 1 else 0
-    beyond = (chosen == 0 and off < -half) or (chosen == times.size - 1 and off > half)
-    note = f"{_outside(log, times, at)}; the {'last' if off > 0 else 'first'} one is taken" if beyond else ""
-    return Part(start, end, (time - log.begin) / 1e9, high - chosen + 1, chosen - low, stamp, first, note)
+    return Part(start, end, (time - log.begin) / 1e9, high - chosen + 1, chosen - low, stamp, first)
 
 
 def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
@@ -96,8 +93,8 @@ def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
     if not (times.size and stamps.size):
         return False
     tried = stamps[[0, stamps.size // 2, -1]].astype("datetime64[ns]")
-    places = (place for stamp in tried if (place := _nearest(log, times, stamp)) is not None)
-    return not any(np.isin(list(_stamps(log, times, place).values()), stamps).any() for place in places)
+    found = (_stamps(log, times, _nearest(log, times, stamp)).values() for stamp in tried)
+    return not any(np.isin(list(near), stamps).any() for near in found)
 
 
 def ns_of(at: Instant, begin: int) -> int:
@@ -116,12 +113,10 @@ def _ns(log: McapLog, at: Instant) -> int:
     return ns_of(at, log.begin if isinstance(at, float | int) else log.first_stamp)
 
 
-def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int | None:
-    """The place of the left image nearest to an instant; None outside the log. times: log times, ns."""
+def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int:
+    """The place of the left image nearest to an instant. times: log times, ns."""
     when, absolute = _ns(log, at), not isinstance(at, float | int)
     delay = sum(time - stamp for time, stamp in _stamps(log, times, 0, 0).items()) if absolute else 0
-    if not times[0] - MARGIN <= when + delay <= times[-1] + MARGIN:
-        return None
     chosen = int(np.argmin(np.abs(times - when - delay)))
     if absolute:
         near = _stamps(log, times, chosen)

@@ -101,7 +101,7 @@ def run_variants(
     if frames < part.frames:
         says_why = f"roverflow run --start {part.first:.3f} --end {part.end:.3f} says why"
         notes.append(f"note: {counted(part.frames - frames, 'frame')} gave no result; {says_why}")
-    return paths, variants, replace(part, frames=frames), [*([f"note: {part.note}"] if part.note else []), *notes]
+    return paths, variants, replace(part, frames=frames), notes
 
 
 def summary_lines(variants: Variants, part: Part) -> list[str]:
