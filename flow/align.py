@@ -156,7 +156,7 @@ class _Sampler(Checked):
 
     ports = ("stream", "at")
     clock = "at"
-    patience: int
+    patience = 0  # ns of log time
 
     def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples."""
@@ -273,23 +273,13 @@ class Nearest(_Sampler):
 
 @dataclass(frozen=True)
 class Latest(_Sampler):
-    """The last sample of `stream` at or before each stamp of `at`, of those logged by then."""
-
-    max_age: int | None = _duration(None, "largest age of a sample; none: any age")
-    patience: int = _duration(0, "log time to wait for samples that are logged late")
+    """The last sample of `stream` at or before each stamp of `at`, of those logged by then, whatever its age."""
 
     def choose(
         self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
     ) -> Any:
-        before, after = _neighbours(samples, stamp)
-        if after is None and not final and self.patience:
-            return None
-        if before is None:
-            return _none(name, stamp, samples, final or f" logged by then ({node}.patience)")
-        if self.max_age is not None and stamp - before.stamp > self.max_age:
-            limit = f"{_time(self.max_age)} ({node}.max_age)"
-            return f"the last {name} sample is {_time(stamp - before.stamp)} old, more than {limit}"
-        return before.value
+        before, _ = _neighbours(samples, stamp)
+        return _none(name, stamp, samples, " logged by then") if before is None else before.value
 
 
 class SamplerState:
