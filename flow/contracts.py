@@ -109,6 +109,9 @@ class Finding:
     about: str = ""
     assumes: str = ""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "severity", Severity(self.severity))
+
     def as_dict(self) -> dict[str, str]:
         """The finding in plain JSON values."""
         return {"severity": str(self.severity), "sentence": self.sentence}

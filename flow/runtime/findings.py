@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from flow.contracts import Finding, Severity
+from flow.contracts import Finding, Severity, StageError
 from flow.runtime.graph import Graph
 from flow.runtime.ledger import failure
 
@@ -17,15 +17,10 @@ def warning(sentence: str) -> Finding:
 
 
 def checked(returned: Any) -> Finding | None:
-    """What a stage returned as its finding. Anything but a Finding or None becomes a warning about it."""
-    if returned is None:
-        return None
-    if not isinstance(returned, Finding):
-        return warning(f"the stage must return a flow.contracts.Finding or None, not {returned!r:.80}")
-    if returned.severity not in tuple(Severity):
-        levels = ", ".join(Severity)
-        return warning(f"{returned.sentence} (a Finding's severity must be one of {levels}, not '{returned.severity}')")
-    return returned
+    """What a stage returned as its finding; raises StageError for anything but a Finding or None."""
+    if isinstance(returned, Finding | None):
+        return returned
+    raise StageError(f"the stage must return a flow.contracts.Finding or None, not {returned!r:.80}")
 
 
 def findings(graph: Graph, states: Mapping[str, Any], surveys: Mapping[str, Finding]) -> dict[str, Finding]:
