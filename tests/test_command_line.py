@@ -213,16 +213,6 @@ def test_the_score_of_a_part_counts_that_part_alone(traverse, tmp_path, said, pa
     assert found["disparity"]["whole_image"]["nonocc"]["bad_1"] < 0.1
 
 
-def test_a_run_that_replaces_the_result_of_another_pipeline_says_so(traverse, tmp_path, said):
-    (tmp_path / "log.mcap").write_bytes(traverse.read_bytes())
-    note = f"note: {tmp_path / 'log-nav.mcap'} replaces the result of pipeline rover; -o OUT.mcap keeps both"
-    for pipeline, noted in (("rover", False), ("fast", True), ("fast", False)):
-        printed = said(0, "run", tmp_path / "log.mcap", "-p", pipeline, *SMALL, "--no-rrd", "--end", 1).out
-        assert (note in printed) == noted
-    refused = said(2, "run", tmp_path / "log.mcap", "-p", "rovr")
-    assert ("note" in refused.out, "one of accurate, fast, paper, rover; did you mean 'rover'" in refused.err) == (0, 1)
-
-
 def test_a_run_without_any_result_replaces_none(tmp_path, said):
     log, out = tmp_path / "log.mcap", tmp_path / "out.mcap"
     write_log(Simulation(frames=1, width=32, height=32, relief_cells=256), log)

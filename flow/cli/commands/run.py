@@ -16,7 +16,7 @@ from flow.cli.report import exit_code, headline, report, say
 from flow.cli.watching import watched
 from flow.errors import SinkError, UsageError
 from recordings.containers.finding import find_files
-from recordings.errors import LogError, UnwritableError
+from recordings.errors import UnwritableError
 from recordings.sinks import DESKS
 
 HELP = "replay a log through a pipeline"
@@ -58,7 +58,6 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Run the pipeline, print the verdict and write the summary."""
     from flow.config.loader import pipeline_file
-    from recordings.scoring.result_log import pipeline_of
 
     find_files(options.log)  # refuses a wrong name at once
     pipeline_file(options.pipeline)
@@ -68,10 +67,6 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve):
         raise UsageError("watching needs the recording; leave out --no-rrd")
-    if options.out is None and out.is_file():
-        with suppress(LogError):  # damaged, or without results
-            if (earlier := pipeline_of(out)) != Path(options.pipeline).stem:
-                say(f"note: {out} replaces the result of pipeline {earlier}; -o OUT.mcap keeps both")
     names = ("workers", "start", "end", "every", "profile", "desk", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
