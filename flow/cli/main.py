@@ -7,7 +7,6 @@ inside `run`, so that `roverflow --help` answers at once.
 from __future__ import annotations
 
 import argparse
-import errno
 import logging
 import re
 import sys
@@ -129,8 +128,6 @@ def _sentence(error: BaseException, traced: bool) -> str:
 def _exit_code(error: BaseException) -> int:
     if isinstance(error, RoverflowError):
         return error.exit_code
-    if isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG:
-        return UNUSABLE
     return UNUSABLE if isinstance(error, LogError) and not isinstance(error, UnwritableError) else FAILED
 
 
