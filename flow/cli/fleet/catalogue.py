@@ -55,9 +55,6 @@ class Catalogue:
             if create:
                 columns = ", ".join(f"{name} {kind}" for name, kind in COLUMNS.items())
                 database.execute(f"CREATE TABLE IF NOT EXISTS logs ({columns})")
-                known = {row["name"] for row in database.execute("PRAGMA table_info(logs)")}
-                for name in COLUMNS.keys() - known:  # of a catalogue of an earlier version
-                    database.execute(f"ALTER TABLE logs ADD COLUMN {name} {COLUMNS[name]}")
 
     def rows(self, where: str = "", sort: str = "name") -> list[dict[str, Any]]:
         """The rows that fulfil an SQL condition, sorted by SQL columns. Raises UsageError for wrong SQL."""

@@ -89,16 +89,13 @@ class Fleet:
         expected = about_worker(task)
         for worker, about in found.items():
             for name, here in expected.items():
-                if about[name] != here and name != "processor":
+                if about[name] != here:
                     raise UsageError(
                         f"the worker {worker} has another {name} ({about[name]}) than this machine ({here})"
                     )
         for worker, why in client.run(unfit, task).items():
             if why:
                 raise UsageError(f"the worker {worker} {why}")
-        processors = sorted({about["processor"] for about in found.values()})
-        if len(processors) > 1:
-            self.progress.say(f"the workers have different processors ({', '.join(processors)}); last bits may differ")
 
     def _end(self, client: Any, name: str, future: Any) -> tuple[Any, str] | None:
         """Write the row of a task that has ended; returns its future and name if it is tried once more."""

@@ -41,11 +41,10 @@ class Pipeline:
 
     @classmethod
     def of(cls, name: str, changes: tuple[str, ...]) -> Pipeline:
-        """The pipeline `name`, as `load` takes it; a file takes the .py files beside it along."""
+        """The pipeline `name`, which `load` accepts; a file takes the .py files beside it along."""
         if name in shipped():
             return cls(name, {}, changes)
         path = Path(name)
-        load(name, changes)  # refuses a wrong one at once
         beside = [path, *sorted(path.parent.glob("*.py"))]
         small = {file.name: file.read_bytes() for file in beside if file.stat().st_size <= MAX_FILE_BYTES}
         return cls(path.name, small, changes)
@@ -202,12 +201,12 @@ def _finished(task: Task) -> dict[str, Any] | None:
 
 
 def about_worker(task: Task) -> dict[str, str]:
-    """What must be the same on all workers, and the processor, which should be."""
+    """What must be the same on all workers."""
     from llvmlite import binding
 
     libraries = {name: version(name) for name in LIBRARIES}
-    target = {"numba target": binding.get_process_triple(), "processor": binding.get_host_cpu_name()}
-    return {"version": product_version(), "pipeline": task.pipeline.digest} | libraries | target
+    target = binding.get_process_triple()
+    return {"version": product_version(), "pipeline": task.pipeline.digest, "numba target": target} | libraries
 
 
 def _absent(task: Task) -> str:
