@@ -28,7 +28,6 @@ def stamps(traverse):
         lambda stamp: str(np.datetime64(stamp, "ns")).replace("T", " "),
         lambda stamp: f"{np.datetime64(stamp, 'ns').astype('datetime64[us]')}Z",
         lambda stamp: str(np.datetime64(stamp, "ns"))[11:23],
-        lambda stamp: f"{stamp / 1e9:.3f}",
         lambda stamp: f"{stamp} ns",
     ],
 )

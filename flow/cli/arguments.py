@@ -6,7 +6,6 @@ import argparse
 import math
 import re
 from contextlib import suppress
-from decimal import Decimal
 from typing import TYPE_CHECKING
 
 from flow.runtime.frame_selection import Every
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
 
 _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
-_UNIX_SECONDS = 1e9  # no log is so long; from here on seconds since 1970
 AT = "seconds after the first message, a time as the viewer shows it, or cursor: that of the open viewer"
 CURSOR = "cursor"  # the instant of a viewer that is open
 
@@ -68,13 +66,13 @@ def seconds(text: str) -> float:
 
 
 def instant(text: str) -> At:
-    """Seconds after a log's first message, or a time as the viewer shows it: UTC, time of day, seconds or ns of Unix.
+    """Seconds after a log's first message, or a time as the viewer shows it: UTC, time of day, or ns since 1970.
 
     Examples
     --------
     >>> instant("12.3")
     12.3
-    >>> instant("2023-11-15 22:13:20.513 000 000Z") == instant("1700086400.513")
+    >>> instant("2023-11-15 22:13:20.513 000 000Z") == instant("1700086400513000000")
     np.True_
     """
     import numpy as np
@@ -92,8 +90,7 @@ def instant(text: str) -> At:
     elif re.fullmatch(r"\d{18,19}|\d{1,19} ?ns", text.strip()):
         return np.datetime64(int(text.strip().removesuffix("ns")), "ns")
     with suppress(argparse.ArgumentTypeError):
-        value = seconds(text)
-        return value if value < _UNIX_SECONDS else np.datetime64(round(Decimal(text) * 1_000_000_000), "ns")
+        return seconds(text)
     raise argparse.ArgumentTypeError(
         f"must be seconds after the log's first message, a time as the viewer shows it in UTC, such as 2023-11-15 "
         f"22:13:20.5 or 22:13:20.5, or {CURSOR}, not '{text}'"
