@@ -23,26 +23,17 @@ MODULES = ("flow.align", "stages", "recordings")  # whose classes a pipeline fil
 
 @dataclass(frozen=True)
 class ParameterReference:
-    """One parameter, its values as a pipeline file writes them; name: "rover.max_step" for a key of a mapping."""
+    """One parameter, its values as a pipeline file writes them.
+
+    name: "rover.max_step" for a key of a mapping; range: the valid values in words, empty where any is valid.
+    """
 
     name: str
     type: str
     meaning: str
     unit: str
-    low: str
-    high: str
+    range: str
     default: str
-    choices: tuple[str, ...]
-
-    @property
-    def range(self) -> str:
-        """The valid values in words; empty where any value of the type is valid."""
-        if self.choices:
-            return ", ".join(self.choices)
-        if self.low and self.high:
-            low = self.low.removesuffix(f" {self.unit}") if self.high.endswith(f" {self.unit}") else self.low
-            return f"{low} to {self.high}"
-        return f"at least {self.low}" if self.low else f"at most {self.high}" if self.high else ""
 
 
 @dataclass(frozen=True)
@@ -156,18 +147,23 @@ def _parameters(kind: type, prefix: str = "") -> Iterator[ParameterReference]:
 
 def _parameter(name: str, hint: Any, known: Field[Any]) -> ParameterReference:
     about = known.metadata
-    unit, low, high = about.get("unit", ""), about.get("low"), about.get("high")
-    default = "required" if is_required(known) else _written(known.default, unit)
+    unit = about.get("unit", "")
     return ParameterReference(
         name=name,
         type=type_name(hint),
         meaning=about.get("help", ""),
         unit=unit,
-        low="" if low is None else _written(low, unit),
-        high="" if high is None else _written(high, unit),
-        default=default,
-        choices=tuple(map(str, about.get("choices") or ())),
+        range=", ".join(map(str, about.get("choices") or ())) or _range(about.get("low"), about.get("high"), unit),
+        default="required" if is_required(known) else _written(known.default, unit),
     )
+
+
+def _range(low: float | None, high: float | None, unit: str) -> str:
+    """The valid values in words; empty where any value of the type is valid."""
+    least, most = ("" if limit is None else _written(limit, unit) for limit in (low, high))
+    if least and most:
+        return f"{least.removesuffix(f' {unit}') if most.endswith(f' {unit}') else least} to {most}"
+    return f"at least {least}" if least else f"at most {most}" if most else ""
 
 
 def _written(value: Any, unit: str) -> str:
