@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 from flow.contracts import counted
@@ -16,14 +16,14 @@ _NOT_CAMERAS = re.compile(r"(^|[^a-z])(mask|disp|disparity|depth|truth|gt)([^a-z
 _MAX_LISTED = 5  # files in a sentence
 _CAMERA = "|".join(f"(?<={word}{dash})" for word in ("cam", "camera", "im", "img", "image") for dash in ("", "_"))
 _RIGHT = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
-# As in names of topics, but also single letters in capitals, and several words at once: left/L_01.png.
+# As in names of topics, but without bare 0 and 1, which may count images; also single letters in capitals, and several
+# words at once: left/L_01.png.
 SIDES: tuple[tuple[re.Pattern[str], str | Callable[[re.Match[str]], str]], ...] = (
     *images.SIDES[:-1],
     (re.compile(r"(?<![A-Za-z])L(?![A-Za-z])"), "R"),
     (re.compile(r"left|Left|LEFT|(?<![A-Za-z])[lL](?![A-Za-z])"), lambda found: _RIGHT[found.group()]),
-    (re.compile(rf"(?:{_CAMERA})0(?!\d)", re.IGNORECASE), "1"),  # not the number of the image, as in cam0/0.png
+    (re.compile(rf"(?:{_CAMERA})0(?!\d)", re.IGNORECASE), "1"),
     (re.compile(r"(?<=image_)(0?)2(?=/)"), r"\g<1>3"),  # the colour cameras of KITTI
-    images.SIDES[-1],
 )
 
 
@@ -41,7 +41,7 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
     for word, other in SIDES:
         partners = {name: word.sub(other, name) for name in names if word.search(name)}
-        pairs = [(one, two) for one, two in partners.items() if two in names and not _is_counter(one, word, names)]
+        pairs = [(one, two) for one, two in partners.items() if two in names]
         if not pairs:
             continue
         paired = {name for pair in pairs for name in pair}
@@ -59,18 +59,9 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
         return [names[one] for one, _ in pairs], [names[two] for _, two in pairs]
     found = counted(len(files), "image")
     raise LogError(
-        f"{folder} contains no image pairs, only {found}; the two names of a pair must differ in left/right, l/r or 0/1"
+        f"{folder} contains no image pairs, only {found}; the two names of a pair must differ in left/right, l/r or "
+        "cam0/cam1"
     )
-
-
-def _is_counter(name: str, side: re.Pattern[str], names: Mapping[str, Path]) -> bool:
-    """Whether the digit of the side in `name` counts images, because other names have 2, 3, ... there."""
-    place = side.search(name)
-    if place is None or not place.group().isdecimal():
-        return False
-    pattern = re.compile(re.escape(name[: place.start()]) + r"(\d+)" + re.escape(name[place.end() :]))
-    counts = [int(found.group(1)) for found in map(pattern.fullmatch, names) if found is not None]
-    return max(counts) > int(place.group()) + 1
 
 
 def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:
