@@ -7,14 +7,13 @@ files mean is not published: the rig file says it. The inclinometer is taken as 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_date, numbers_of, read_rows, whole_number
+from recordings.importers.files import from_date, numbers_of, read_rows
 from recordings.importers.pairing import pair_images
 from recordings.importers.recording import (
     BASE,
@@ -28,9 +27,8 @@ from recordings.importers.recording import (
 )
 from recordings.importers.rig import INCLINOMETER, LENS, Rig
 from recordings.importers.track import upright
-from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import up_of
-from recordings.ros2.to_msg import header, imu
+from recordings.ros2.to_msg import imu
 from stages.data import Transform
 
 # Width of the images -> f and (cx, cy), px, of the two rectified sets.
@@ -63,7 +61,7 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
     return ImportedRecording(
         rectified_models(camera), True, pairs,
         [rig.mount, beside(camera), Transform(BASE, IMU, np.eye(3), np.zeros(3))],
-        [_tilts(folder, rig, stamps), _positions(folder / "gps-topocentric.txt", stamps)], notes=notes,
+        [_tilts(folder, rig, stamps)], notes=notes,
     )  # fmt: skip
 
 
@@ -105,17 +103,3 @@ def _tilts(folder: Path, rig: Rig, stamps: dict[int, int]) -> list[Logged]:
             raise LogError(f"{where}: {error}") from error
         found.append((stamp, "/inclinometer", imu(stamp, IMU, upright(up))))
     return sorted(found, key=lambda item: item[0])
-
-
-def _positions(path: Path, stamps: dict[int, int]) -> Iterator[Logged]:
-    """The places by GPS at the images: east, north and up, m."""
-    if not path.exists():
-        return
-    rows = [(stamps.get(whole_number(row[0], where), 0), where, row) for where, row in read_rows(path, 4)]
-    for stamp, where, row in sorted(rows, key=lambda item: item[0]):
-        if not stamp:
-            continue
-        x, y, z = numbers_of(row[1:4], where).tolist()
-        point = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
-        message = make("geometry_msgs/msg/PointStamped", header=header(stamp, "topocentric"), point=point)
-        yield stamp, "/gps/position", message

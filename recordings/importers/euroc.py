@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from flow.contracts import counted
-from recordings.calibration.formats import StereoCalibration, read_calibration
+from recordings.calibration.formats import read_calibration
 from recordings.calibration.yaml_files import numbers, read_yaml
 from recordings.errors import LogError
-from recordings.importers.files import exists, nanoseconds, numbers_of, read_rows
+from recordings.importers.files import nanoseconds, numbers_of, read_rows, rotation_of
 from recordings.importers.recording import (
     IMU,
     LEFT,
@@ -33,6 +33,7 @@ from recordings.ros2.to_msg import raw_imu
 from recordings.source.transforms import rigid
 
 # Relative to mav0. Position, then quaternion w, x, y, z, of the body in a world with z up.
+CAMERAS = ("cam0", "cam1")  # left and right
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt")
 
 
@@ -46,19 +47,21 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
     if not (folder / "cam0").is_dir():
         raise LogError(f"{source} contains no mav0 with cam0, cam1 and imu0; give the folder of one sequence")
     if not calibration:
-        calibration = [folder / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
+        calibration = [folder / camera / "sensor.yaml" for camera in CAMERAS]
         if not calibration[0].exists():
             raise LogError(f"there is no {calibration[0]}; give --calibration, such as Kalibr's camchain.yaml")
     notes = [
         f"{path.name} of {path.parent.name} begins with %YAML:1.0, which is no YAML; the line is ignored"
         for path in calibration if path.is_file() and path.read_bytes().startswith(b"%YAML:")
     ]  # fmt: skip
-    (left, right), calibrated = ordered(("cam0", "cam1"), read_calibration(calibration), notes)
+    calibrated = read_calibration(calibration)
     if calibrated.camera_from_imu is None or calibrated.right_in_left is None:
         raise LogError(f"{calibration[0]} lacks the transform between Imu and camera; give the file of imu and cameras")
+    if calibrated.baseline < 0:
+        raise LogError("cam1 is the left camera by the calibration; exchange the names of cam0 and cam1")
     camera_from_imu = calibrated.camera_from_imu @ _imu_in_body(folder / "imu0" / "sensor.yaml")
     mounts = [rig.mount, rigid(LEFT, RIGHT, calibrated.right_in_left), rigid(LEFT, IMU, camera_from_imu)]
-    pairs = _pairs(folder, left, right, notes)
+    pairs = _pairs(folder, notes)
     truth = next((path for name in TRUTHS if (path := folder / name / "data.csv").exists()), None)
     return ImportedRecording(
         raw_models(calibrated, common_size(pairs)), False, pairs,
@@ -67,26 +70,15 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
     )  # fmt: skip
 
 
-def ordered(
-    names: tuple[str, str], calibration: StereoCalibration, notes: list[str]
-) -> tuple[tuple[str, str], StereoCalibration]:
-    """The cameras with the left one first, by the calibration; a note if that exchanges them."""
-    moved = calibration.right_in_left
-    if moved is None or moved[0, 3] > 0:
-        return names, calibration
-    notes.append(f"{names[1]} is the left camera by the calibration, and {names[0]} the right one")
-    return (names[1], names[0]), calibration.exchanged()
-
-
-def _pairs(folder: Path, left: str, right: str, notes: list[str]) -> list[ImagePair]:
+def _pairs(folder: Path, notes: list[str]) -> list[ImagePair]:
     """The pairs of equal stamps of which both files exist; notes about the others."""
     found: list[dict[int, Path]] = []
-    for camera in (left, right):
+    for camera in CAMERAS:
         listed = {
             nanoseconds(row[0], where): folder / camera / "data" / row[1]
             for where, row in read_rows(folder / camera / "data.csv", 2, ",")
         }
-        there = {stamp: path for stamp, path in listed.items() if exists(path)}
+        there = {stamp: path for stamp, path in listed.items() if path.exists()}
         if missing := [path.name for stamp, path in listed.items() if stamp not in there]:
             names = f"{missing[0]}{' and others' if len(missing) > 1 else ''}"
             notes.append(f"{camera}/data.csv lists {counted(len(missing), 'image')} that {camera}/data lacks: {names}")
@@ -117,5 +109,5 @@ def _track(path: Path) -> Track:
     poses = []
     for where, row in read_rows(path, 8, ","):
         values = numbers_of(row[1:8], where)
-        poses.append((nanoseconds(row[0], where), values[:3], np.roll(values[3:], -1)))
+        poses.append((nanoseconds(row[0], where), values[:3], rotation_of(np.roll(values[3:], -1), where)))
     return Track.of(IMU, poses, path)

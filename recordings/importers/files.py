@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from datetime import datetime
@@ -28,11 +27,6 @@ def read_bytes(path: Path) -> bytes:
         return Path(path).read_bytes()
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror or error}") from error
-
-
-def exists(path: Path) -> bool:
-    """Whether a file is there; a name that is too long is not."""
-    return os.path.exists(path)  # noqa: PTH110  # Path.exists raises OSError for such a name
 
 
 def read_lines(path: Path) -> Iterator[tuple[str, str]]:
@@ -66,18 +60,11 @@ def numbers_of(values: list[str], where: str) -> Array:
     return found
 
 
-def rotation_of(quaternion: Array, where: str) -> Array:
-    """The rotation (3, 3) of a quaternion x, y, z, w. Raises LogError unless its length is 1."""
+def rotation_of(quaternion: Array, where: str) -> Rotation:
+    """The rotation of a quaternion x, y, z, w. Raises LogError unless its length is 1."""
     if not abs((length := float(np.linalg.norm(quaternion))) - 1) <= MAX_ROUNDING:
         raise LogError(f"{where} has a quaternion of the length {length:g}; get the file again")
-    return np.asarray(Rotation.from_quat(quaternion).as_matrix())
-
-
-def whole_number(text: str, where: str) -> int:
-    """A number of an image. Raises LogError."""
-    if not text.isdecimal():
-        raise LogError(f"{where} begins with '{text}', not with the number of an image; get the file again")
-    return int(text)
+    return Rotation.from_quat(quaternion)
 
 
 def nanoseconds(text: str, where: str) -> int:

@@ -140,7 +140,7 @@ def _readings(oxts: Path) -> tuple[list[int], Array]:
 def _track(stamps: list[int], table: Array, where: Path) -> Track:
     """The poses of the Imu: east, north and up of the first place."""
     places = np.column_stack([mercator(table[:, 0], table[:, 1]), table[:, 2]])
-    turns = Rotation.from_euler("ZYX", table[:, 5:2:-1]).as_quat()
+    turns = Rotation.from_euler("ZYX", table[:, 5:2:-1])
     return Track.of(IMU, list(zip(stamps, places, turns, strict=True)), where)
 
 

@@ -116,5 +116,5 @@ def _track(path: Path, stamps: list[int], mount: Transform, shift: Array) -> Tra
         pose = row.reshape(3, 4)
         place = mount.rotation @ (pose[:, 3] - pose[:, :3] @ shift)
         turn = Rotation.from_matrix(mount.rotation @ orthonormal(pose[:, :3], where))
-        poses.append((stamp, place, turn.as_quat()))
+        poses.append((stamp, place, turn))
     return Track.of(LEFT, poses, path)

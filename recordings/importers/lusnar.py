@@ -64,6 +64,6 @@ def _track(path: Path, rig: Rig) -> Track:
         if len(row) < 8:
             raise LogError(f"{where} has {len(row)} columns, but at least 8 are needed; get the file again")
         values = numbers_of(row[1:8], where)
-        turn = upright @ rotation_of(np.roll(values[3:], -1), where) @ axes
-        poses.append((nanoseconds(row[0], where), upright @ values[:3], Rotation.from_matrix(turn).as_quat()))
+        turn = upright @ rotation_of(np.roll(values[3:], -1), where).as_matrix() @ axes
+        poses.append((nanoseconds(row[0], where), upright @ values[:3], Rotation.from_matrix(turn)))
     return Track.of(BASE, poses, path)

@@ -77,8 +77,8 @@ def _track(path: Path) -> Track:
     poses = []
     for number, (where, row) in enumerate(read_rows(path, 7)):
         values = numbers_of(row[:7], where)
-        turn = Rotation.from_matrix(_DOWN @ rotation_of(values[3:], where) @ _DOWN @ BODY_FROM_OPTICAL).as_quat()
-        poses.append((FIRST_STAMP + number * PERIOD_NS, _DOWN @ values[:3], turn))
+        turn = _DOWN @ rotation_of(values[3:], where).as_matrix() @ _DOWN @ BODY_FROM_OPTICAL
+        poses.append((FIRST_STAMP + number * PERIOD_NS, _DOWN @ values[:3], Rotation.from_matrix(turn)))
     return Track.of(LEFT, poses, path)
 
 

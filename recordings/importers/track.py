@@ -29,19 +29,16 @@ class Track:
     rotations: Rotation
 
     @staticmethod
-    def of(body: str, poses: Sequence[tuple[int, Array, Array]], where: object) -> Track:
-        """The track of (stamp, position, quaternion xyzw) in any order. Raises LogError for one that is no pose."""
+    def of(body: str, poses: Sequence[tuple[int, Array, Rotation]], where: object) -> Track:
+        """The track of (stamp, position, rotation) in any order. Raises LogError for a position that is none."""
         if not poses:
             raise LogError(f"{where} contains no pose; get the file again")
         ordered = sorted({stamp: (place, turn) for stamp, place, turn in poses}.items())
-        turns = np.array([turn for _, (_, turn) in ordered])
-        lengths = np.linalg.norm(turns, axis=1)
-        if (wrong := np.flatnonzero(~(np.abs(lengths - 1) <= 1e-2))).size:
-            raise LogError(f"{where}: the quaternion at {ordered[wrong[0]][0]} ns has the length {lengths[wrong[0]]:g}")
         places = np.array([place for _, (place, _) in ordered])
         if (wrong := np.flatnonzero(~np.isfinite(places).all(axis=1))).size:
             raise LogError(f"{where}: the position at {ordered[wrong[0]][0]} ns is {places[wrong[0]].tolist()}")
-        return Track(body, np.array([stamp for stamp, _ in ordered]), places, Rotation.from_quat(turns))
+        turns = Rotation.concatenate([turn for _, (_, turn) in ordered])
+        return Track(body, np.array([stamp for stamp, _ in ordered]), places, turns)
 
     def at(self, stamp: int) -> Transform | None:
         """world <- body at a stamp, interpolated between two poses at most a second apart; else None."""
