@@ -72,18 +72,14 @@ class TerrainTally:
         self.heights = {ring: (HeightErrors(), HeightErrors()) for ring in RINGS}
         self.counts = Counter[str]()
 
-    def add(
-        self, truth: TrueGround, layers: dict[str, Array], cells: Array | None, tilts: Array | None = None
-    ) -> dict[str, float]:
+    def add(self, truth: TrueGround, layers: dict[str, Array], cells: Array | None) -> dict[str, float]:
         """Add one frame; returns its main metrics.
 
-        layers: of the elevation map, on the truth's grid, or empty; cells: `Cell` codes or None. tilts: (N, 2) errors
-        of the tilt to test the stated sigma with, as slopes along x and y. A frame has one tilt error, which all of its
-        cells share, so few frames cannot test sigmas that contain it. If given, the sums are over these errors.
+        layers: of the elevation map, on the truth's grid, or empty; cells: `Cell` codes or None.
         """
         unknown = np.full(truth.seen.shape, np.nan)
         elevation = layers.get("elevation", unknown).astype(np.float64)
-        self._add_heights(truth, layers, elevation, np.zeros((1, 2)) if tilts is None else tilts)
+        self._add_heights(truth, layers, elevation)
         cells = np.full(truth.seen.shape, np.int8(Cell.UNKNOWN)) if cells is None else cells
         hazards, rocks = _hazards(truth, cells), _rocks(truth, cells)
         self.counts.update(hazards)
@@ -98,7 +94,7 @@ class TerrainTally:
             **{f"rocks_{name}": float(rocks[f"{name}_{HIGH_ROCK:g}"]) for name in ("visible", "detected")},
         }
 
-    def _add_heights(self, truth: TrueGround, layers: dict[str, Array], elevation: Array, tilts: Array) -> None:
+    def _add_heights(self, truth: TrueGround, layers: dict[str, Array], elevation: Array) -> None:
         known = np.isfinite(elevation)
         error = np.where(truth.seen, elevation - truth.mean, np.nan)
         levelled = without_plane(truth.x, truth.y, error)
@@ -111,30 +107,27 @@ class TerrainTally:
         counts = {
             "values": known & within,
             "hallucinated": known & within & ~truth.in_view,
-            "between_pixels": known & within & truth.in_view & ~truth.seen,
             "unseen": known & within & ~truth.seen,
             "claimed": known & within & ~truth.seen & ~marked,
-            "values_seen": known & within & truth.seen,
-            "marked_seen": known & within & truth.seen & marked,
         }
         self.counts.update(_summed(counts))
         if "variance" in layers:
             variance = layers["variance"].astype(np.float64)
             common = layers.get("common_variance", np.zeros_like(variance))
             self.counts.update(_intervals("random", levelled, variance))
-            for east, north in tilts:
-                lean = east * truth.x[None, :] + north * truth.y[:, None]
-                self.counts.update(_intervals("total", error + lean, variance + common))
+            self.add_total(truth, error, variance + common)
+
+    def add_total(self, truth: TrueGround, error: Array, variance: Array) -> None:
+        """Add the errors of heights, m, of one frame, and their variances, those of the tilt included."""
+        self.counts.update(_intervals("total", error, variance))
 
     def metrics(self) -> dict[str, Any]:
         """All metrics; shares 0 to 1, lengths m, NaN if nothing was measured.
 
-        heights: ring -> seen (visible cells), completeness, and `HeightErrors.metrics` raw and levelled; hallucinated:
-        as share of all values; between_pixels, unseen, claimed: as share of all values (between_pixels: in view but not
-        visible); marked_seen: visible values marked interpolated, as share of the visible ones; intervals: share
-        of levelled errors within 1 and 2 stated random sigmas (random), and of raw errors within sigmas of random and
-        common variance (total); rocks: "0.2 m", "0.3 m" -> visible, detected, recall,
-        partly_visible, partly_visible_detected; hazards: see `_hazards`.
+        heights: ring -> seen (visible cells), completeness, and `HeightErrors.metrics` raw and levelled; hallucinated,
+        unseen, claimed: as share of all values; intervals: share of levelled errors within 1 and 2 stated random sigmas
+        (random), and of raw errors within sigmas of random and common variance (total); rocks: "0.2 m", "0.3 m" ->
+        visible, detected, recall, partly_visible, partly_visible_detected; hazards: see `_hazards`.
         """
         c = self.counts
         heights = {
@@ -159,21 +152,18 @@ class TerrainTally:
 
         return {
             "heights": heights,
-            "hallucinated": {"of_values": part("hallucinated", "values"),
-                        "between_pixels": part("between_pixels", "values"), "unseen": part("unseen", "values"),
-                        "claimed": part("claimed", "values"), "marked_seen": part("marked_seen", "values_seen")},
+            "hallucinated": {"of_values": part("hallucinated", "values"), "unseen": part("unseen", "values"),
+                             "claimed": part("claimed", "values")},
             "intervals": {name: {str(k): part(f"{name}_in_{k}", f"{name}_judged") for k in (1, 2)}
                           for name in ("random", "total")},
             "rocks": rocks,
             "hazards": {
                 "recall": part("hazards_detected", "hazards"),
                 "false_safe": part("hazards_free", "hazards"),
-                "rock_recall": part("rock_cells_detected", "rock_cells"),
                 "rock_false_safe": part("rock_cells_free", "rock_cells"),
                 "free_on_rock": part("free_on_rock", "free"),
                 "false_alarm": part("false_alarms", "safe"),
                 "unknown": part("unknown", "seen"),
-                "free_hazard": part("free_hazard", "free"),
                 "free_unseen": part("free_unseen", "free"),
                 "by_slope": {f"{low:g}-{high:g} deg": part(f"false_alarms_{low:g}", f"safe_{low:g}")
                              for low, high in pairwise(SLOPES)},
@@ -191,8 +181,8 @@ def _intervals(name: str, error: Array, variance: Array) -> dict[str, int]:
 def _hazards(truth: TrueGround, cells: Array) -> dict[str, int]:
     """Sums over the cells of one frame.
 
-    Of visible cells: hazards, those detected, those called free; the same of cells on a rock; safe cells, those called
-    hazards, also by slope; unknown cells. Of all cells called free: those on a rock, hazards, and those out of view.
+    Of visible cells: hazards, those detected, those called free; cells on a rock, those called free; safe cells, those
+    called hazards, also by slope; unknown cells. Of all cells called free: those on a rock, and those out of view.
     """
     free, flagged, seen = cells == Cell.FREE, cells == Cell.HAZARD, truth.seen
     on_rock = truth.rock >= np.float32(HIGH_ROCK)
@@ -204,13 +194,11 @@ def _hazards(truth: TrueGround, cells: Array) -> dict[str, int]:
         "hazards_detected": seen & truth.hazard & flagged,
         "hazards_free": seen & truth.hazard & free,
         "rock_cells": seen & on_rock,
-        "rock_cells_detected": seen & on_rock & flagged,
         "rock_cells_free": seen & on_rock & free,
         "safe": safe,
         "false_alarms": safe & flagged,
         "free": free,
         "free_on_rock": free & on_rock,
-        "free_hazard": free & truth.hazard,
         "free_unseen": free & ~truth.in_view,
     }
     for low, high in pairwise(SLOPES):

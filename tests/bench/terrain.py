@@ -44,11 +44,25 @@ TILT_SAMPLES = 10  # after a frame, from which a pipeline takes what it smooths 
 TERRAIN_STREAMS = ("cloud", "cleaned", "points", "cells", "elevation_map", "navigation_map")
 
 
+class TiltedTally(TerrainTally):
+    """Tests the stated sigmas with many errors of the tilt.
+
+    A frame has one error of the tilt, which all of its cells share, so few frames cannot test sigmas that contain it.
+    tilts: (N, 2) such errors, as slopes along x and y.
+    """
+
+    tilts: Array = np.zeros((1, 2))
+
+    def add_total(self, truth: TrueGround, error: Array, variance: Array) -> None:
+        for east, north in self.tilts:
+            super().add_total(truth, error + east * truth.x[None, :] + north * truth.y[:, None], variance)
+
+
 @dataclass
 class Run:
     """What one pipeline made of some frames."""
 
-    tally: TerrainTally = field(default_factory=TerrainTally)
+    tally: TiltedTally = field(default_factory=TiltedTally)
     seconds: list[float] = field(default_factory=list)
 
 
@@ -165,8 +179,8 @@ def score(simulations: Sequence[Simulation], stride: int, runs: dict[str, str]) 
                 exact["tilt"] = replace(exact["tilt"], sigma=tilt.sigma)
                 streams, seconds = through(pipeline, given | (exact if "true" in name else {"tilt": tilt}))
                 layers: dict[str, Array] = dict(streams["elevation_map"].layers)
-                tilts = others[pipeline] - tilt_error(simulation, streams["tilt"])
-                found[name].tally.add(ground, layers, streams["navigation_map"].cells, tilts)
+                found[name].tally.tilts = others[pipeline] - tilt_error(simulation, streams["tilt"])
+                found[name].tally.add(ground, layers, streams["navigation_map"].cells)
                 found[name].seconds.append(seconds)
     return found
 

@@ -155,7 +155,7 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert heights["0-8 m"]["seen"] == heights["0-4 m"]["seen"] + heights["4-8 m"]["seen"]
     assert hazards["recall"] == 1
     assert hazards["false_safe"] == hazards["false_alarm"] == hazards["unknown"] == 0
-    assert hazards["free_hazard"] == hazards["free_on_rock"] == 0
+    assert hazards["free_on_rock"] == 0
     assert rocks["0.2 m"]["visible"] > 5
     assert rocks["0.2 m"]["recall"] == rocks["0.3 m"]["recall"] == 1
     assert found.tilt["frames"] == 2
@@ -238,7 +238,6 @@ def test_the_shares_of_a_blind_map_are_in_its_row_of_a_table(tmp_path, truth, fr
 def test_free_cells_on_rocks_or_out_of_view_are_shares_of_free_cells(tmp_path, truth, frames):
     maps = [ground_truth.truth_maps(SMALL, 0, frame) for frame in frames]
     found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain["hazards"]
-    assert found["free_hazard"] == np.mean([navigation.cells == Cell.HAZARD for _, navigation in maps])
     assert found["free_on_rock"] == np.mean([navigation.reason == CellReason.STEP for _, navigation in maps])
     assert found["free_unseen"] == np.mean([terrain.layers["in_view"] < 0.5 for terrain, _ in maps])
 
