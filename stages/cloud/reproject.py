@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stages.cloud.kernels.triangulation import DisparitySigma, triangulate
+from stages.cloud.kernels.triangulation import triangulate
 from stages.data import Disparity, PointCloud, StereoFrame
 from stages.matching.intensity import eight_bit
 from stages.stage import Stage, check_joined, parameter
@@ -19,8 +19,7 @@ class Reproject(Stage):
     """Triangulates a disparity image.
 
     The standard deviation of a matched disparity is its own, `Disparity.sigma`. Where the image has none, it falls
-    geometrically with the confidence, from `sigma_worst` at 0 to `sigma_best` at 1 (see "Stated sigmas" in
-    docs/terrain.md).
+    with the confidence (see "Stated sigmas" in docs/terrain.md).
 
     Examples
     --------
@@ -41,26 +40,14 @@ class Reproject(Stage):
         "no farther apart than twice this; 0: all points",
         unit="m", low=0.0, high=1.0,
     )  # fmt: skip
-    sigma_best: float = parameter(0.086, "disparity standard deviation at confidence 1", unit="px", low=1e-3)
-    sigma_worst: float = parameter(42.0, "disparity standard deviation at confidence 0", unit="px", low=1e-3)
-    sigma_plane: float = parameter(0.75, "disparity standard deviation of a PLANE pixel", unit="px", low=0.0)
-    sigma_filled: float = parameter(3.0, "disparity standard deviation of a FILLED pixel", unit="px", low=0.0)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.sigma_best <= self.sigma_worst:
-            raise ValueError(
-                f"Reproject.sigma_worst must be at least sigma_best ({self.sigma_best} px), not {self.sigma_worst} px"
-            )
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> PointCloud:
         """The cloud of `disparity`, with the colours of the left image in 8 bit; it may be empty."""
         camera = disparity.camera or frame.camera
         check_joined(self, frame, disparity)
-        sigma_d = DisparitySigma(self.sigma_best, self.sigma_worst, self.sigma_plane, self.sigma_filled)
         colors = eight_bit(frame.left)[0]
         points, rgb, sigma, pixel = triangulate(
-            disparity, colors, camera, sigma_d, self.max_depth, self.include_filled, self.max_spacing
+            disparity, colors, camera, self.max_depth, self.include_filled, self.max_spacing
         )
         height, width = disparity.pixels.shape
         source = disparity.source.ravel().take(pixel)

@@ -6,8 +6,6 @@ arrays are allocated at their final size.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from stages.compiled.jit import kernel, part
@@ -19,20 +17,16 @@ _UNKNOWN = int(PixelOrigin.UNKNOWN)
 COLUMN_SPACING = 2  # of columns over that of rows: ground ahead is foreshortened along the columns, not along the rows
 
 
-class DisparitySigma(NamedTuple):
-    """Standard deviation of a disparity, px; from confidence 1 to confidence 0 it rises geometrically."""
-
-    best: float  # at confidence 1
-    worst: float  # at confidence 0
-    plane: float  # of origin PLANE
-    filled: float  # of origin FILLED
+# Standard deviations of disparities, px. Of a match without its own it rises geometrically from confidence 1 to 0.
+SIGMA_BEST, SIGMA_WORST = 0.086, 42.0
+SIGMA_PLANE, SIGMA_FILLED = 0.75, 3.0  # of the origins PLANE and FILLED
+_LOG_BEST, _LOG_WORST = float(np.log(SIGMA_BEST)), float(np.log(SIGMA_WORST))
 
 
 def triangulate(
     disparity: Disparity,
     colors: Array,
     camera: StereoCamera,
-    sigma: DisparitySigma,
     max_depth: float,
     filled: bool,
     max_spacing: float = 0.0,
@@ -54,7 +48,6 @@ def triangulate(
         float(max_depth),
         bool(filled),
         _dense_limits(camera, max_spacing),
-        (float(np.log(sigma.best)), float(np.log(sigma.worst)), float(sigma.plane), float(sigma.filled)),
         np.empty((0, 0), np.float32) if disparity.sigma is None else np.ascontiguousarray(disparity.sigma),
     )
 
@@ -76,9 +69,8 @@ def _has_point(effective, source, max_depth, focal_baseline, filled):
 
 
 @kernel
-def _triangulate(disparity, source, confidence, colors, camera, max_depth, filled, dense, sigmas, own):
+def _triangulate(disparity, source, confidence, colors, camera, max_depth, filled, dense, own):
     fx, fy, cx, cy, focal_baseline, shift = camera
-    log_best, log_worst, sigma_plane, sigma_filled = sigmas
     height, width = disparity.shape
     count = 0
     for row in range(height):
@@ -106,14 +98,14 @@ def _triangulate(disparity, source, confidence, colors, camera, max_depth, fille
             rgb[n, 0], rgb[n, 1] = colors[row, col, 0], colors[row, col, green]
             rgb[n, 2] = colors[row, col, blue]
             if origin == _FILLED:
-                sigma_d = sigma_filled
+                sigma_d = SIGMA_FILLED
             elif origin == _PLANE:
-                sigma_d = sigma_plane
+                sigma_d = SIGMA_PLANE
             elif own.size:
                 sigma_d = np.float64(own[row, col])
             else:
                 trust = min(np.float64(confidence[row, col]), 1.0) if confidence[row, col] > 0.0 else 0.0
-                sigma_d = np.exp(log_worst + (log_best - log_worst) * trust)
+                sigma_d = np.exp(_LOG_WORST + (_LOG_BEST - _LOG_WORST) * trust)
             sigma[n] = z * z / focal_baseline * sigma_d
             pixel[n] = row * width + col
             n += 1
@@ -124,7 +116,6 @@ def triangulate_reference(
     disparity: Disparity,
     colors: Array,
     camera: StereoCamera,
-    sigma: DisparitySigma,
     max_depth: float,
     filled: bool,
     max_spacing: float = 0.0,
@@ -141,10 +132,10 @@ def triangulate_reference(
     points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
     trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
-    sigma_d = sigma.worst * (sigma.best / sigma.worst) ** trust
+    sigma_d = SIGMA_WORST * (SIGMA_BEST / SIGMA_WORST) ** trust
     sigma_d = sigma_d if disparity.sigma is None else disparity.sigma[v, u].astype(np.float64)
-    sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, sigma.plane, sigma_d)
-    sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, sigma.filled, sigma_d)
+    sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, SIGMA_PLANE, sigma_d)
+    sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, SIGMA_FILLED, sigma_d)
     sigma_z = z * z / (camera.fx * camera.baseline) * sigma_d
     pixel = v * disparity.pixels.shape[1] + u
     return points.astype(np.float32), rgb, sigma_z.astype(np.float32), pixel.astype(np.int32)

@@ -33,7 +33,8 @@ RINGS = ((0, 2), (2, 4), (4, 6), (6, 8))
 def cloud_with_noise(seed: int = 0, sigma: float = 0.25) -> PointCloud:
     d = seen_disparity()
     d = d + np.random.default_rng(seed).normal(0, sigma, d.shape)
-    return Reproject(max_depth=50, sigma_best=0.25)(blank_frame(), as_disparity(d))
+    disparity = replace(as_disparity(d), sigma=np.full(d.shape, 0.25, np.float32))
+    return Reproject(max_depth=50)(blank_frame(), disparity)
 
 
 def with_floaters(cloud: PointCloud, share: float, seed: int = 1) -> tuple[PointCloud, Array]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages.cloud.kernels.triangulation import DisparitySigma, triangulate, triangulate_reference
+from stages.cloud.kernels.triangulation import SIGMA_BEST, SIGMA_WORST, triangulate, triangulate_reference
 from stages.cloud.reproject import Reproject
 from stages.data import Disparity, PixelOrigin, StereoCamera, StereoFrame
 from tests.stages.terrain.terrain_scene import CAMERA, as_disparity, blank_frame, seen_disparity
@@ -42,11 +42,11 @@ def test_triangulation_kernel_equals_the_reference() -> None:
     source = random.integers(0, 4, pixels.shape).astype(np.uint8)
     confidence = random.uniform(-0.1, 1.1, pixels.shape).astype(np.float32)
     confidence[0, 5] = np.nan
-    disparity, sigma = Disparity(0, pixels, source, confidence), DisparitySigma(0.25, 1.0, 0.7, 3.0)
+    disparity = Disparity(0, pixels, source, confidence)
     for colors in (random.integers(0, 256, (12, 16, 3), np.uint8), random.integers(0, 256, (12, 16), np.uint8)):
         for filled in (False, True):
             for spacing in (0.0, 0.04):
-                arguments = (disparity, colors, SMALL, sigma, 8.0, filled, spacing)
+                arguments = (disparity, colors, SMALL, 8.0, filled, spacing)
                 for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
                     assert got.dtype == want.dtype
                     np.testing.assert_allclose(got, want, rtol=1e-6)
@@ -58,9 +58,9 @@ def test_filled_pixels_become_points_on_request_and_planes_always() -> None:
     disparity = Disparity(0, np.full((1, 4), 5, np.float32), source, np.ones((1, 4), np.float32))
     frame = blank_frame(camera)
     assert Reproject()(frame, disparity).pixel.tolist() == [0, 1]
-    cloud = Reproject(include_filled=True, sigma_best=0.2, sigma_plane=0.7, sigma_filled=3.0)(frame, disparity)
+    cloud = Reproject(include_filled=True)(frame, disparity)
     assert cloud.pixel.tolist() == [0, 1, 2]
-    assert cloud.sigma == pytest.approx(np.array([0.2, 0.7, 3.0]) * 4.0**2 / (100 * 0.2))
+    assert cloud.sigma == pytest.approx(np.array([0.086, 0.75, 3.0]) * 4.0**2 / (100 * 0.2))
     assert cloud.source is not None
     assert cloud.source.tolist() == [PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED]
 
@@ -68,7 +68,8 @@ def test_filled_pixels_become_points_on_request_and_planes_always() -> None:
 def test_depth_sigma_predicts_the_scatter_of_noisy_disparities() -> None:
     camera = StereoCamera(969.0, 969.0, 320.0, 240.0, 0.24, 640, 480)
     d = 30 + np.random.default_rng(2).normal(0, 0.25, (480, 640))
-    cloud = Reproject(sigma_best=0.25)(blank_frame(camera), as_disparity(d, camera))
+    disparity = replace(as_disparity(d, camera), sigma=np.full(d.shape, 0.25, np.float32))
+    cloud = Reproject()(blank_frame(camera), disparity)
     assert cloud.points[:, 2].std() == pytest.approx(cloud.sigma.mean(), rel=0.02)
 
 
@@ -76,8 +77,8 @@ def test_depth_sigma_grows_geometrically_as_confidence_falls() -> None:
     camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 5, 1)
     confidence = np.linspace(1, 0, 5, dtype=np.float32)[None]
     disparity = Disparity(0, np.full((1, 5), 5, np.float32), np.ones((1, 5), np.uint8), confidence)
-    sigma = Reproject(sigma_best=0.1, sigma_worst=1.6)(blank_frame(camera), disparity).sigma
-    assert sigma / sigma[0] == pytest.approx([1, 2, 4, 8, 16])
+    sigma = Reproject()(blank_frame(camera), disparity).sigma
+    assert sigma / sigma[0] == pytest.approx((SIGMA_WORST / SIGMA_BEST) ** np.linspace(0, 1, 5), rel=1e-5)
 
 
 def test_points_beyond_max_depth_are_left_out_and_a_cloud_may_be_empty() -> None:
@@ -127,8 +128,3 @@ def test_the_camera_of_the_disparity_takes_precedence() -> None:
     assert cloud.frame_id == "other"
     without = replace(as_disparity(pixels, other), camera=None)
     assert Reproject()(blank_frame(SMALL), without).points[:, 2] == pytest.approx(100.0 * 0.2 / (3.5 + 1.5))
-
-
-def test_wrong_sigmas_are_refused() -> None:
-    with pytest.raises(ValueError, match="sigma_worst must be at least"):
-        Reproject(sigma_best=43.0)
