@@ -53,8 +53,6 @@ def nearest_two(codes: Array, others: Array) -> tuple[Array, Array, Array]:
     Returns its index (the first of equals), its Hamming distance and that of the next best, (N,) int32 each. A distance
     of 256 counts as 255.
     """
-    if not 2 <= len(others) <= MAX_OTHERS:
-        raise ValueError(f"nearest_two compares with 2 to {MAX_OTHERS} descriptors, not {len(others)}")
     columns = -(-len(others) // LANES) * LANES
     planes, outside = np.zeros((BYTES, columns), np.uint8), np.full(columns, 255, np.uint8)
     planes[:, : len(others)] = others.T
