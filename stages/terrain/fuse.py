@@ -170,19 +170,18 @@ class _Fusion(Stage):
         self, frame: FrameGrid, observed: Observation, pose: Pose, up: Array, tilt_sigma: float, state: FusedMap
     ) -> tuple[Array, Array]:
         """The map's cells (rows, cols) below the frame, and the plane (3,) that aligns the frame to them."""
-        cells, stated = state.cells.read(frame.row, frame.col, *frame.terrain.shape), self._stated
-        if state.levelling is not None:
-            levelling = state.levelling.moved(pose, stated).tilted(up, tilt_sigma)
+        cells = state.cells.read(frame.row, frame.col, *frame.terrain.shape)
+        if state.levelling is None:
+            levelling = MapLevelling.begin(pose, self._stated).tilted(up, tilt_sigma).placed()
+        else:
+            levelling = state.levelling.moved(pose, self._stated).tilted(up, tilt_sigma)
             expected = levelling.plane(up)
             plane, covariance, overlaps = self._fitted(taken(cells, frame.known), observed, expected)
             if self._jumped(plane, expected, state):
                 state.reset(frame.terrain.frame_id, frame.terrain.stamp)
                 state.resets += 1
-                cells = np.zeros_like(cells)
-            elif overlaps:
-                levelling = levelling.overlapped(plane, covariance, up)
-        if state.levelling is None:
-            levelling = MapLevelling.begin(pose, stated).tilted(up, tilt_sigma).placed()
+                return self._aligned(frame, observed, pose, up, tilt_sigma, state)  # as the first frame of a new map
+            levelling = levelling.overlapped(plane, covariance, up) if overlaps else levelling
         levelling = levelling.corrected()
         state.levelling, state.plane, state.rejected = levelling, levelling.plane(up), 0
         return cells, state.plane
