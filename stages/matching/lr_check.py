@@ -25,7 +25,6 @@ class LeftRightCheck(Stage):
 
     lr_tolerance: float = parameter(1.0, "largest left-right difference", unit="px", low=0)
     disparities: int = parameter(0, "search range of `backward`; 0: that of `disparity`", unit="px", low=0)
-    threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, disparity: Disparity, backward: Disparity) -> Disparity:
         if disparity.pixels.shape != backward.pixels.shape:
@@ -35,7 +34,5 @@ class LeftRightCheck(Stage):
             )
         check_same_time(self, disparity=disparity.stamp, backward=backward.stamp)
         found, right = ((layer.pixels, layer.source, layer.confidence) for layer in (disparity, backward))
-        pixels, source, confidence = drop_inconsistent(
-            found, right, self.lr_tolerance, self.disparities or math.inf, self.threads
-        )
+        pixels, source, confidence = drop_inconsistent(found, right, self.lr_tolerance, self.disparities or math.inf)
         return replace(disparity, pixels=pixels, source=source, confidence=confidence, costs=None)

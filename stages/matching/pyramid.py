@@ -48,7 +48,6 @@ class Upsample(Stage):
     """
 
     keep_sigma: bool = parameter(False, "double the sigma as well; a prior needs none")
-    threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         height, width = frame.left.shape[:2]
@@ -56,7 +55,7 @@ class Upsample(Stage):
         if small != ((height + 1) // 2, (width + 1) // 2):
             raise StageError(f"Upsample: the disparity has shape {small}, which is not half of {(height, width)}")
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
-        pixels = doubled(disparity.pixels, height, width, self.threads)
+        pixels = doubled(disparity.pixels, height, width)
         layers = [disparity.source, disparity.confidence]
         if self.keep_sigma and disparity.sigma is not None:
             layers.append(2 * disparity.sigma)

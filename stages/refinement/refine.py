@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, Disparity, StereoFrame
 from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.image_noise import frame_noise
@@ -140,10 +139,10 @@ class Refine(Stage):
     def _refined(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         image, other = eight_bit(frame.left, frame.right)
         guide, right = frame.once(gray_pair)
-        saturated = _saturated(frame.left, guide, SATURATION_LEVEL, self.threads)
+        saturated = _saturated(frame.left, guide, SATURATION_LEVEL)
         matches, weights, reasons = self._matches(disparity, saturated, guide, right)
         smoothed = self._median(matches)
-        within = extent(smoothed, self.threads)
+        within = extent(smoothed)
         planar, labels, agreed = self._with_planes(smoothed, weights, within, image, disparity.stamp)
         filled, kinds = self._filled(planar, within, image, guide, right)
         guessed = kinds != KEPT
@@ -151,7 +150,6 @@ class Refine(Stage):
         refined, sigma, consistent = self._supported(sharp, guessed, frame)
         source, confidence = label_origin(
             matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
-            self.threads,
         )  # fmt: skip
         stated = sigma if self.support else None
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera, stated)
@@ -159,14 +157,14 @@ class Refine(Stage):
     def _matches(self, disparity: Disparity, saturated: Array, guide: Array, right: Array) -> tuple[Array, ...]:
         """Trusted matches with subpixel fractions fitted to brightness, their weights, and reasons of the others."""
         matches, weights, reasons = trusted_matches(
-            disparity.pixels, disparity.source, disparity.confidence, self.min_confidence, saturated, self.threads
+            disparity.pixels, disparity.source, disparity.confidence, self.min_confidence, saturated
         )
         if self.subpixel_radius:
             matches = fit_brightness(guide, right, matches, self.subpixel_radius, self.threads)
         return matches, weights, reasons
 
     def _median(self, matches: Array) -> Array:
-        return near_median(matches, self.median_size, MAX_CORRECTION, self.threads) if self.median_size else matches
+        return near_median(matches, self.median_size, MAX_CORRECTION) if self.median_size else matches
 
     def _with_planes(
         self, pixels: Array, weights: Array, within: Extent, image: Array, seed: int
@@ -179,12 +177,10 @@ class Refine(Stage):
         margin = MAX_EXTRAPOLATION if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
         accepted = self._accepted(planes, MIN_VALID_SHARE)
-        pixels, agreed = pull_to_planes(
-            pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight, margin, self.threads
-        )
+        pixels, agreed = pull_to_planes(pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight, margin)
         if not self.surface_size:
             return pixels, labels, agreed
-        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size), self.threads)
+        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size))
         # Every other pixel of every other row is enough for a region.
         few = np.s_[::2, ::2]
         sparse, regions = (layer[few].copy() for layer in (pixels, labels))
@@ -194,9 +190,7 @@ class Refine(Stage):
             self.threads,
         )  # fmt: skip
         accepted = (self._accepted(planes, MIN_VALID_SHARE / 2, 2) * [0.5, 0.5, 1])[group]
-        pixels, again = pull_to_planes(
-            pixels, accepted, labels, within, MAX_CORRECTION / 2, self.plane_weight, margin, self.threads
-        )
+        pixels, again = pull_to_planes(pixels, accepted, labels, within, MAX_CORRECTION / 2, self.plane_weight, margin)
         return pixels, labels, agreed | again
 
     def _accepted(self, planes: Planes, valid_share: float, spacing: int = 1) -> Array:
@@ -210,7 +204,7 @@ class Refine(Stage):
         if not self.fill:
             return pixels, np.where(np.isnan(pixels), np.uint8(OCCLUSION), np.uint8(KEPT))
         found = fill_holes(pixels, image, within, MAX_FILL_DISTANCE, MAX_EXTRAPOLATION, self.threads)
-        return bridge_holes(pixels, *found, guide, right, self.threads) if self.bridge else found
+        return bridge_holes(pixels, *found, guide, right) if self.bridge else found
 
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
@@ -236,16 +230,9 @@ class Refine(Stage):
         return sharpen_edges(pixels, guessed, image, other, self.edge_radius, DEPTH_EDGE, EDGE_COLOUR, self.threads)
 
 
-def _saturated(image: Array, guide: Array, level: int, threads: int) -> Array:
+def _saturated(image: Array, guide: Array, level: int) -> Array:
     """Where the image is even and saturated in a colour, (H, W) bool: matches there are noise."""
-    found = np.zeros(guide.shape, bool)
-
-    def mark(first: int, end: int) -> None:
-        rows = image[first:end]
-        bright = rows >= level if image.ndim == 2 else cv2.inRange(rows, (0,) * 3, (level - 1,) * 3) == 0
-        if bright.any():
-            found[first:end] = bright & (contrast(guide, first, end) <= MAX_EVEN_CONTRAST)
-
-    if image.dtype == np.uint8:  # the saturation level of more bits is unknown
-        by_bands(shared_by(threads), len(image), mark)
-    return found
+    if image.dtype != np.uint8:  # the saturation level of more bits is unknown
+        return np.zeros(guide.shape, bool)
+    bright = image >= level if image.ndim == 2 else cv2.inRange(image, (0,) * 3, (level - 1,) * 3) == 0
+    return bright & (contrast(guide, 0, len(guide)) <= MAX_EVEN_CONTRAST) if bright.any() else bright

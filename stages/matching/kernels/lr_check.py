@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from stages.compiled.jit import kernel, part
-from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, PixelOrigin, known
 
 F32 = np.float32
@@ -14,24 +13,16 @@ _known = part(known)
 Layers = tuple[Array, Array, Array]
 
 
-def drop_inconsistent(
-    found: Layers, backward: Layers, tolerance: float, max_disparity: float, threads: int = 1
-) -> Layers:
+def drop_inconsistent(found: Layers, backward: Layers, tolerance: float, max_disparity: float) -> Layers:
     """The layers of `found` without the pixels whose partner's disparity differs by more than `tolerance` px.
 
     Disparities above `max_disparity` px, and those whose partner is unknown or outside the image, are kept.
     found: pixels (H, W) float32, px, NaN = unknown; source (H, W) uint8; confidence (H, W) float32; backward: the same
     of the swapped frame, so mirrored.
     """
-    left = tuple(np.empty(layer.shape, layer.dtype) for layer in found)
-
-    def drop(first: int, end: int) -> None:
-        rows = slice(first, end)
-        given, made = ([layer[rows] for layer in layers] for layers in (found, left))
-        _drop(*given, backward[0][rows], backward[1][rows], F32(tolerance), F32(max_disparity), *made)
-
-    by_bands(shared_by(threads), len(found[0]), drop)
-    return left[0], left[1], left[2]
+    left = np.empty_like(found[0]), np.empty_like(found[1]), np.empty_like(found[2])
+    _drop(*found, *backward[:2], F32(tolerance), F32(max_disparity), *left)
+    return left
 
 
 @kernel
@@ -62,7 +53,7 @@ def _drop(
 
 
 def drop_inconsistent_reference(found: Layers, backward: Layers, tolerance: float, max_disparity: float) -> Layers:
-    """`drop_contradicted` in plain numpy."""
+    """`drop_inconsistent` in plain numpy."""
     pixels = found[0]
     theirs = np.where(known(backward[1]), backward[0], F32(np.nan))[:, ::-1]
     partner = np.rint(np.arange(pixels.shape[1]) - pixels.astype(np.float64))

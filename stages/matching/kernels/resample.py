@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import inlined_part, kernel
-from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
@@ -22,21 +21,21 @@ def halved(image: Array) -> Array:
     return half
 
 
-def doubled(small: Array, height: int, width: int, threads: int = 1) -> Array:
+def doubled(small: Array, height: int, width: int) -> Array:
     """A disparity image at double size with doubled values, (height, width) float32, px, NaN = unknown.
 
     small: (H, W) float32, of half the size, rounded up.
     """
     large = np.empty((height, width), np.float32)
-    by_bands(shared_by(threads), height, lambda first, end: _double(small, large, first, end))
+    _double(small, large)
     return large
 
 
 @kernel
-def _double(small, large, first, end):
-    rows, columns = small.shape
-    width, last = large.shape[1], columns - 1
-    for y in range(first, end):
+def _double(small, large):
+    (rows, columns), (height, width) = small.shape, large.shape
+    last = columns - 1
+    for y in range(height):
         row, beside = small[y >> 1], small[min(max((y >> 1) + (y & 1) * 2 - 1, 0), rows - 1)]
         target = large[y]
         for col in range(np.uint64(1), np.uint64(max(last, 1))):  # without sign: numba looks for no negative index

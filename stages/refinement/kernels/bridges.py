@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from stages.compiled.jit import kernel, part
-from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.refinement.kernels.holes import BRIDGE, KEPT, MIN_SURFACE_STEP, OCCLUSION, OPEN
 
@@ -25,16 +24,12 @@ RADIUS = 1  # rows above and below whose images count
 PARTS = 16  # of a pixel; whole numbers sum to the same in any order
 
 
-def bridge_holes(
-    disparity: Array, filled: Array, kinds: Array, left: Array, right: Array, threads: int = 1
-) -> tuple[Array, Array]:
+def bridge_holes(disparity: Array, filled: Array, kinds: Array, left: Array, right: Array) -> tuple[Array, Array]:
     """`filled` and `kinds` with bridges, which have the kind `BRIDGE`; both arrays are changed.
 
     disparity: (H, W) float32, px, NaN = hole; filled, kinds: as `fill_holes` returns them; left, right: (H, W) uint8.
     """
-    by_bands(
-        shared_by(threads), len(disparity), lambda top, end: _bridge(disparity, left, right, top, end, filled, kinds)
-    )
+    _bridge(disparity, left, right, filled, kinds)
     return filled, kinds
 
 
@@ -79,9 +74,9 @@ def _is_bridge(disparity, left, right, y, first, end, filled, kinds):
 
 
 @kernel
-def _bridge(disparity, left, right, begin, stop, filled, kinds):
-    width = disparity.shape[1]
-    for y in range(begin, stop):
+def _bridge(disparity, left, right, filled, kinds):
+    height, width = disparity.shape
+    for y in range(height):
         x = 1
         while x < width:
             if kinds[y, x] == KEPT or kinds[y, x - 1] != KEPT:

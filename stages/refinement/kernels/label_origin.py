@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, PixelOrigin
 from stages.refinement.kernels.holes import BRIDGE, KEPT, OCCLUSION
 
@@ -33,7 +32,7 @@ class Trust(NamedTuple):
 
 def label_origin(
     matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, consistent: Array, reasons: Array,
-    sigma: Array, max_move: float, trust: Trust, threads: int = 1,
+    sigma: Array, max_move: float, trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Source and confidence of each pixel, (H, W) uint8 codes of `PixelOrigin` and float32.
 
@@ -50,15 +49,10 @@ def label_origin(
         [np.interp(steps, MATCH_CONFIDENCES, values) for values in (trust.agreed, trust.alone)], np.float32
     )
     others = np.array(trust[2:], np.float32)
-
-    def label(first: int, end: int) -> None:
-        rows = slice(first, end)
-        _label(
-            matches[rows], confidence[rows], agreed[rows], kinds[rows], refined[rows], consistent[rows], reasons[rows],
-            sigma[rows], F32(max_move), tables, others, source[rows], worth[rows],
-        )  # fmt: skip
-
-    by_bands(shared_by(threads), len(matches), label)
+    _label(
+        matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, F32(max_move), tables, others, source,
+        worth,
+    )  # fmt: skip
     return source, worth
 
 

@@ -1,6 +1,6 @@
 """Selects the trusted matches, moves them to their median, and applies accepted planes.
 
-Each step is one pass over the image in bands of rows, where numpy would need a dozen.
+Each step is one pass over the image, where numpy would need a dozen.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import kernel, part
-from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array, PixelOrigin, known
 from stages.refinement.kernels.holes import MIN_SURFACE_STEP
 from stages.refinement.kernels.valid_extent import Extent
@@ -22,7 +21,7 @@ _known = part(known)
 
 
 def trusted_matches(
-    pixels: Array, source: Array, confidence: Array, min_confidence: float, saturated: Array, threads: int = 1
+    pixels: Array, source: Array, confidence: Array, min_confidence: float, saturated: Array
 ) -> tuple[Array, Array, Array]:
     """The MEASURED disparities that count as matches.
 
@@ -32,35 +31,23 @@ def trusted_matches(
     """
     matches, weights = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.float32)
     reasons = np.empty(pixels.shape, np.uint8)
-    layers = pixels, source, confidence, saturated, matches, weights, reasons
-
-    def trust(first: int, end: int) -> None:
-        _trust(F32(min_confidence), *(layer[first:end] for layer in layers))
-
-    by_bands(shared_by(threads), len(pixels), trust)
+    _trust(F32(min_confidence), pixels, source, confidence, saturated, matches, weights, reasons)
     return matches, weights, reasons
 
 
-def near_median(matches: Array, side: int, near: float, threads: int = 1) -> Array:
+def near_median(matches: Array, side: int, near: float) -> Array:
     """Each match moved to the median of its side x side px window where that is at most `near` px away.
 
     A match in a window of mostly holes has no median and stays. matches: (H, W) float32, NaN = unknown.
     """
     moved = np.empty(matches.shape, np.float32)
-
-    def move(first: int, end: int) -> None:
-        about, own = with_margin(matches, first, end, side // 2)
-        median = cv2.medianBlur(np.fmax(about, F32(-np.inf)), side)[own]  # -inf for NaN
-        _move_near(matches[first:end], median, F32(near), moved[first:end])
-
-    by_bands(shared_by(threads), len(matches), move)
+    _move_near(matches, cv2.medianBlur(np.fmax(matches, F32(-np.inf)), side), F32(near), moved)  # -inf for NaN
     return moved
 
 
 def pull_to_planes(
-    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int,
-    threads: int = 1,
-) -> tuple[Array, Array]:  # fmt: skip
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int
+) -> tuple[Array, Array]:
     """Disparities within `near` px of their region's plane move towards it, and holes take its value.
 
     pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
@@ -70,9 +57,8 @@ def pull_to_planes(
     Returns the disparities, (H, W) float32, and the pixels that a plane moved or filled, (H, W) bool.
     """
     pulled, applied = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
-    given = pixels, coefficients, labels, within, F32(near), F32(weight), margin
     low, high = (extreme.reduce(pixels.ravel(), keepdims=True)[0] for extreme in (np.fmin, np.fmax))
-    by_bands(shared_by(threads), len(pixels), lambda first, end: _pull(*given, low, high, first, end, pulled, applied))
+    _pull(pixels, coefficients, labels, within, F32(near), F32(weight), margin, low, high, pulled, applied)
     return pulled, applied
 
 
@@ -125,9 +111,9 @@ def _move_near(matches, median, near, moved):
 
 
 @kernel
-def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high, first, end, pulled, applied):
-    width = pixels.shape[1]
-    for y in range(first, end):
+def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high, pulled, applied):
+    height, width = pixels.shape
+    for y in range(height):
         row = pixels[y]
         last, after, ceiling = -1, -1, high  # columns of the known pixels before and after x; bound of a plane
         for x in range(width):

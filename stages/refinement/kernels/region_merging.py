@@ -12,14 +12,13 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import shared_by
 from stages.data import Array
 from stages.refinement.kernels.slic import COMPACTNESS
 
 ITERATIONS = 3
 
 
-def merge_regions(image: Array, labels: Array, count: int, groups: int, threads: int = 1) -> tuple[Array, int]:
+def merge_regions(image: Array, labels: Array, count: int, groups: int) -> tuple[Array, int]:
     """Merge superpixels into about `groups` regions.
 
     image: (H, W) gray or (H, W, 3) RGB, uint8; labels: (H, W) int32 in 0..count-1. Returns the region of each
@@ -28,22 +27,17 @@ def merge_regions(image: Array, labels: Array, count: int, groups: int, threads:
     height, width = image.shape[:2]
     step = math.sqrt(height * width / min(groups, count))
     rows, cols = max(1, round(height / step)), max(1, round(width / step))
-    points, size = _superpixel_points(image, labels, count, COMPACTNESS / step, threads)
+    points, size = _superpixel_points(image, labels, count, COMPACTNESS / step)
     home = np.floor(points[:, 3:] / (COMPACTNESS / step) * [rows / height, cols / width]).astype(int)
     nearest = _nearest_cells(points, size, np.minimum(home, [rows - 1, cols - 1]), rows, cols)
     used, region = np.unique(nearest, return_inverse=True)
     return region.astype(np.int32), len(used)
 
 
-def _superpixel_points(image: Array, labels: Array, count: int, scale: float, threads: int) -> tuple[Array, Array]:
+def _superpixel_points(image: Array, labels: Array, count: int, scale: float) -> tuple[Array, Array]:
     """Mean colour (CIELAB, L in 0..100), y and x times `scale`, (count, 5), and size, (count,), of each superpixel."""
-    middle = image.shape[0] // 2
-    halves = np.zeros((2, count, 6), np.int64)
-    shared_by(threads)(
-        lambda: _add_pixels(image[:middle], labels[:middle], 0, halves[0]),
-        lambda: _add_pixels(image[middle:], labels[middle:], middle, halves[1]),
-    )
-    sums = halves[0] + halves[1]
+    sums = np.zeros((count, 6), np.int64)
+    _add_pixels(image, labels, sums)
     means = sums[:, :5] / sums[:, 5:]
     rgb = np.clip(np.rint(means[None, :, :3]), 0, 255).astype(np.uint8)
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[0] * [100 / 255, 1, 1]
@@ -80,15 +74,15 @@ def _nearest_cells(points, size, home, rows, cols):
 
 
 @kernel
-def _add_pixels(image, labels, first, sums):
-    """Add R, G, B, y, x and 1 of each pixel to the sums of its label; row 0 is row `first` of the image."""
+def _add_pixels(image, labels, sums):
+    """Add R, G, B, y, x and 1 of each pixel to the sums of its label."""
     gray = image.ndim == 2
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
             total = sums[labels[y, x]]
             for channel in range(3):
                 total[channel] += np.int64(image[y, x] if gray else image[y, x, channel])
-            total[3] += first + y
+            total[3] += y
             total[4] += x
             total[5] += 1
 

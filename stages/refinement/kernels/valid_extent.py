@@ -13,7 +13,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import by_bands, shared_by, with_margin
 from stages.data import Array
 
 SPECK_WINDOW = 15  # px, side of the window in which known pixels are counted
@@ -28,23 +27,17 @@ class Extent(NamedTuple):
     last: Array  # (H,) int64, last known column of each row
 
 
-def extent(disparity: Array, threads: int = 1) -> Extent:
+def extent(disparity: Array) -> Extent:
     """The valid extent of a disparity image, (H, W) float32, NaN = unknown."""
     height, width = disparity.shape
-    known, evidence = ~np.isnan(disparity), np.empty(disparity.shape, bool)
+    known = ~np.isnan(disparity)
     least = int(MIN_RELATIVE_DENSITY * SPECK_WINDOW**2 * (np.count_nonzero(known) / known.size))
     found = Extent(np.full(width, height, np.int64), np.full(height, 2 * width, np.int64), np.full(height, -width))
-
-    def ignore_specks(first: int, end: int) -> None:
-        about, own = with_margin(known.view(np.uint8), first, end, SPECK_WINDOW // 2)
-        around = cv2.boxFilter(
-            about, cv2.CV_16U, (SPECK_WINDOW, SPECK_WINDOW), normalize=False, borderType=cv2.BORDER_REPLICATE
-        )
-        np.logical_and(known[first:end], around[own] > least, out=evidence[first:end])
-        _find_ends(evidence[first:end], found.first[first:end], found.last[first:end])
-
-    by_bands(shared_by(threads), height, ignore_specks)
-    _find_top(evidence, found.top)
+    window, border = (SPECK_WINDOW, SPECK_WINDOW), cv2.BORDER_REPLICATE
+    around = cv2.boxFilter(known.view(np.uint8), cv2.CV_16U, window, normalize=False, borderType=border)
+    known &= around > least
+    _find_ends(known, found.first, found.last)
+    _find_top(known, found.top)
     return found
 
 

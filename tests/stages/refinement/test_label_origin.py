@@ -11,8 +11,8 @@ from stages.refinement.kernels.label_origin import Trust, label_origin, label_or
 TRUST = Trust((0.88, 0.98, 0.99), (0.62, 0.86, 0.97), 0.85, 0.83, 0.84, 0.58, 0.56)
 
 
-@given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
-def test_origin_and_confidence_equal_the_reference(height, width, seed, threads):
+@given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31))
+def test_origin_and_confidence_equal_the_reference(height, width, seed):
     rng = np.random.default_rng(seed)
     shape = height, width
     matches = np.where(rng.random(shape) < 0.4, np.nan, rng.uniform(2, 9, shape)).astype(np.float32)
@@ -24,7 +24,7 @@ def test_origin_and_confidence_equal_the_reference(height, width, seed, threads)
     sigma = rng.choice([0, 0.1, 0.3, 2, 1e6], shape).astype(np.float32)
     agreed, correlated = (rng.random(shape) < share for share in (0.5, 0.8))
     given = matches, confidence, agreed, kinds, refined, correlated, reasons, sigma, 0.5, TRUST
-    source, worth = label_origin(*given, threads)
+    source, worth = label_origin(*given)
     expected, expected_worth = label_origin_reference(*given)
     assert np.array_equal(source, expected)
     assert np.allclose(worth, expected_worth, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Trusted matches, medians and applied planes equal plain references, on one thread or two."""
+"""Trusted matches, medians and applied planes equal plain references."""
 
 import numpy as np
 from hypothesis import given
@@ -26,33 +26,32 @@ def scene(height, width, seed):
     return pixels, coefficients, labels
 
 
-@given(st.integers(1, 20), st.integers(1, 30), st.sampled_from([-1.0, 0.0, 3.0]), st.integers(0, 2**31),
-       st.sampled_from([1, 2]))  # fmt: skip
-def test_planes_pull_and_fill_as_in_the_reference(height, width, margin, seed, threads):
+@given(st.integers(1, 20), st.integers(1, 30), st.sampled_from([-1.0, 0.0, 3.0]), st.integers(0, 2**31))
+def test_planes_pull_and_fill_as_in_the_reference(height, width, margin, seed):
     pixels, coefficients, labels = scene(height, width, seed)
     within = extent(pixels)
-    pulled, applied = pull_to_planes(pixels, coefficients, labels, within, 2.0, 0.7, margin, threads)
+    pulled, applied = pull_to_planes(pixels, coefficients, labels, within, 2.0, 0.7, margin)
     expected, expected_applied = pull_to_planes_reference(pixels, coefficients, labels, within, 2.0, 0.7, margin)
     assert np.allclose(pulled, expected, atol=1e-5, equal_nan=True)
     assert np.array_equal(applied, expected_applied)
 
 
 @given(st.integers(1, 24), st.integers(1, 30), st.sampled_from([3, 5]), st.sampled_from([0.0, 1.5, 1000.0]),
-       st.integers(0, 2**31), st.sampled_from([1, 2]))  # fmt: skip
-def test_the_median_equals_that_of_sorted_windows(height, width, side, near, seed, threads):
+       st.integers(0, 2**31))  # fmt: skip
+def test_the_median_equals_that_of_sorted_windows(height, width, side, near, seed):
     pixels, *_ = scene(height, width, seed)
-    moved = near_median(pixels, side, near, threads)
+    moved = near_median(pixels, side, near)
     assert np.array_equal(moved, near_median_reference(pixels, side, near), equal_nan=True)
 
 
-@given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31), st.sampled_from([1, 2]))
-def test_trusted_matches_equal_the_reference(height, width, seed, threads):
+@given(st.integers(1, 20), st.integers(1, 30), st.integers(0, 2**31))
+def test_trusted_matches_equal_the_reference(height, width, seed):
     pixels, *_ = scene(height, width, seed)
     rng = np.random.default_rng(seed)
     source = rng.integers(0, len(PixelOrigin), pixels.shape, dtype=np.uint8)
     confidence = rng.choice(np.array([0.2, 0.5, 0.7], np.float32), pixels.shape)
     saturated = rng.random(pixels.shape) < 0.1
-    ours = trusted_matches(pixels, source, confidence, 0.5, saturated, threads)
+    ours = trusted_matches(pixels, source, confidence, 0.5, saturated)
     for made, plain in zip(ours, trusted_matches_reference(pixels, source, confidence, 0.5, saturated), strict=True):
         np.testing.assert_array_equal(made, plain)
 
