@@ -23,6 +23,12 @@ def disparity_rows(disparity: Disparity, first: int, end: int) -> Disparity:
     return Disparity(disparity.stamp, disparity.pixels[rows], disparity.source[rows], disparity.confidence[rows])
 
 
+def rows_without_sigma(disparity: Disparity) -> range:
+    """The rows that are not refined yet, among refined ones: with a sigma of NaN only. None if all rows are alike."""
+    rows = np.empty(0, int) if disparity.sigma is None else np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
+    return range(rows[0], rows[-1] + 1) if 0 < len(rows) < len(disparity.pixels) else range(0)
+
+
 def with_rows(whole: Disparity, first: int, part: Disparity) -> Disparity:
     """`whole` with the rows of `part` from row `first` on.
 

@@ -98,7 +98,7 @@ class PoseFilter(Stage):
         before = state.estimate
         bias = self._bias(tilt)
         if state.logged is not None and state.logged.stamp == motion.stamp:
-            estimate = _logged(state.logged, motion, motion.camera, mount, (state.distance, bias))
+            estimate = _logged(state.logged, motion, motion.camera, mount, state.distance, bias)
         elif before is None or before.segment != motion.segment:
             estimate = self._first(motion, motion.camera, tilt, mount)
         else:
@@ -162,15 +162,15 @@ class PoseFilter(Stage):
 
 
 def _logged(
-    pose: Pose, motion: CameraMotion, camera: Transform, mount: Mount, common: tuple[float, float]
+    pose: Pose, motion: CameraMotion, camera: Transform, mount: Mount, distance: float, bias: float
 ) -> _Estimate:
-    """The estimate of a frame that became this pose in a result log. common: distance and bias of its common errors."""
+    """The estimate of a frame that became this pose in a result log. distance, bias: of its common errors."""
     base = mount.base_from_camera
     world = pose.transform if base is None else pose.transform.after(base)
-    errors = _common_errors(pose.position, *common)
+    errors = _common_errors(pose.position, distance, bias)
     own = np.zeros((6, 6)) if pose.covariance is None else pose.covariance - errors.T @ errors
     covariance = translated_covariance(own, world.translation - pose.position)
-    return _Estimate(motion.segment, camera, motion.covariance, world, covariance, common[0])
+    return _Estimate(motion.segment, camera, motion.covariance, world, covariance, distance)
 
 
 def _predicted(before: _Estimate, motion: CameraMotion, camera: Transform) -> _Estimate:

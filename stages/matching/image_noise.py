@@ -60,11 +60,11 @@ def frame_noise(frame: StereoFrame) -> Array:
 def noise_levels(image: Array) -> Array:
     """Standard deviation of the noise at each gray level, (256,) float32, of an image (H, W) uint8."""
     variance, level = _samples(image)
+    if not level.size:  # a black or white image
+        return np.full(LEVELS, np.sqrt(MIN_VARIANCE), np.float32)
     by_bin = np.argsort(level // BIN, kind="stable")
     ends = np.cumsum(np.bincount(level // BIN, minlength=LEVELS // BIN))
     groups = [group for group in np.split(by_bin, ends) if len(group) >= MIN_BLOCKS] or [by_bin]
-    if not level.size:  # a black or white image
-        return np.full(LEVELS, np.sqrt(MIN_VARIANCE), np.float32)
     levels = np.array([level[group].mean() for group in groups])
     smooth = np.array([_quantile(variance[group], SMOOTH_SHARE) for group in groups]) / SMOOTH_VARIANCE
     offset, gain = _line(levels, np.maximum(smooth, MIN_VARIANCE), np.array([len(group) for group in groups]))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from stages.data import Array, Disparity, StereoFrame
-from stages.data.rows import disparity_rows, frame_rows, with_rows
+from stages.data.rows import disparity_rows, frame_rows, rows_without_sigma, with_rows
 from stages.matching.image_noise import frame_noise
 from stages.matching.intensity import alike, eight_bit, gray_pair
 from stages.matching.kernels.texture import contrast, slopes
@@ -129,12 +129,12 @@ class Refine(Stage):
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
-        matched = np.empty(0, int) if disparity.sigma is None else np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
-        if not 0 < len(matched) < len(disparity.pixels):
+        rows = rows_without_sigma(disparity)
+        if not rows:
             return self._refined(frame, disparity)
-        first, end = int(matched[0]), int(matched[-1]) + 1
-        refined = self._refined(frame.once(frame_rows, first, end), disparity_rows(disparity, first, end))
-        return with_rows(replace(disparity, costs=None, camera=frame.camera), first, refined)
+        part = disparity_rows(disparity, rows.start, rows.stop)
+        refined = self._refined(frame.once(frame_rows, rows.start, rows.stop), part)
+        return with_rows(replace(disparity, costs=None, camera=frame.camera), rows.start, refined)
 
     def _refined(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         image, other = eight_bit(frame.left, frame.right)
@@ -174,24 +174,33 @@ class Refine(Stage):
             return pixels, None, np.zeros(pixels.shape, bool)
         aimed = max(1, min(self.superpixels, pixels.size // self.min_superpixel_size))
         labels, count = superpixels(image, aimed, self.threads)
-        margin = MAX_EXTRAPOLATION if self.plane_fill else -1
         planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
         accepted = self._accepted(planes, MIN_VALID_SHARE)
-        pixels, agreed = pull_to_planes(pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight, margin)
+        pixels, agreed = self._pulled(pixels, accepted, labels, within, MAX_CORRECTION)
         if not self.surface_size:
             return pixels, labels, agreed
-        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size))
-        # Every other pixel of every other row is enough for a region.
-        few = np.s_[::2, ::2]
-        sparse, regions = (layer[few].copy() for layer in (pixels, labels))
-        sparse[weights[few] == 0] = np.nan  # filled pixels are no evidence for the second planes
-        planes = fit_planes(
-            sparse, group.take(regions), groups, np.ascontiguousarray(weights[few]), self.hypotheses, seed + 1,
-            self.threads,
-        )  # fmt: skip
-        accepted = (self._accepted(planes, MIN_VALID_SHARE / 2, 2) * [0.5, 0.5, 1])[group]
-        pixels, again = pull_to_planes(pixels, accepted, labels, within, MAX_CORRECTION / 2, self.plane_weight, margin)
+        accepted = self._planes_of_regions(pixels, weights, image, labels, count, seed + 1)
+        pixels, again = self._pulled(pixels, accepted, labels, within, MAX_CORRECTION / 2)
         return pixels, labels, agreed | again
+
+    def _planes_of_regions(
+        self, pixels: Array, weights: Array, image: Array, labels: Array, count: int, seed: int
+    ) -> Array:
+        """The accepted plane (count, 3) of each superpixel's region, NaN for the others.
+
+        A region is less likely to be flat, so it moves matches half as far, and it is larger, so it needs half the
+        share of matches. Every other pixel of every other row is enough; their slopes are twice those of pixels.
+        """
+        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size))
+        few = np.s_[::2, ::2]
+        sparse, regions, sparse_weights = (layer[few].copy() for layer in (pixels, labels, weights))
+        sparse[sparse_weights == 0] = np.nan  # filled pixels are no evidence for the second planes
+        planes = fit_planes(sparse, group.take(regions), groups, sparse_weights, self.hypotheses, seed, self.threads)
+        return (self._accepted(planes, MIN_VALID_SHARE / 2, 2) * [0.5, 0.5, 1])[group]
+
+    def _pulled(self, pixels: Array, planes: Array, labels: Array, within: Extent, near: float) -> tuple[Array, Array]:
+        weight, fill = self.plane_weight, self.plane_fill
+        return pull_to_planes(pixels, planes, labels, within, near, weight, fill, MAX_EXTRAPOLATION)
 
     def _accepted(self, planes: Planes, valid_share: float, spacing: int = 1) -> Array:
         """The coefficients (n, 3) of the supported planes, of pixels `spacing` px apart; NaN for the others."""

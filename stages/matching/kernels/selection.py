@@ -103,7 +103,7 @@ def fit_row(winner, votes, partners, first, top, params, pixels, evidence, sourc
     """Disparities of a row, to a fraction of a pixel, where the winner is reliable, the evidence, and the reasons.
 
     winner, votes, partners: of `find_winners` and `find_partners`; first: (W,) int32, disparity of the first lane;
-    top: the last lane that is a disparity; rule: `SgmParams`; into pixels (W,) float32, px, NaN = unknown; evidence
+    top: the last lane that is a disparity; params: `SgmParams`; into pixels (W,) float32, px, NaN = unknown; evidence
     (W,) uint8: by how much the winner beats all but its neighbours, 0 where unknown; source (W,) uint8: codes of
     `PixelOrigin`, the first check that fails.
 

@@ -46,19 +46,20 @@ def near_median(matches: Array, side: int, near: float) -> Array:
 
 
 def pull_to_planes(
-    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int
-) -> tuple[Array, Array]:
-    """Disparities within `near` px of their region's plane move towards it, and holes take its value.
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, fill: bool,
+    margin: int,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Disparities within `near` px of their region's plane move towards it, and with `fill` holes take its value.
 
     pixels: (H, W) float32, px, NaN = hole; coefficients: (n, 3) float64 of the accepted planes, NaN for the others;
-    labels: (H, W) int32; weight: of the plane; margin: px outside the valid extent `within` that are filled, negative:
-    no hole is. A plane fills only values within the range of all pixels: others are extrapolated too far. If the left
-    end of a hole is farther than the right one, the hole is occluded: a plane nearer to the right end does not fill it.
-    Returns the disparities, (H, W) float32, and the pixels that a plane moved or filled, (H, W) bool.
+    labels: (H, W) int32; weight: of the plane; margin: px outside the valid extent `within` that are filled. A plane
+    fills only values within the range of all pixels: others are extrapolated too far. If the left end of a hole is
+    farther than the right one, the hole is occluded: a plane nearer to the right end does not fill it. Returns the
+    disparities, (H, W) float32, and the pixels that a plane moved or filled, (H, W) bool.
     """
     pulled, applied = np.empty(pixels.shape, np.float32), np.empty(pixels.shape, np.bool_)
     low, high = (extreme.reduce(pixels.ravel(), keepdims=True)[0] for extreme in (np.fmin, np.fmax))
-    _pull(pixels, coefficients, labels, within, F32(near), F32(weight), margin, low, high, pulled, applied)
+    _pull(pixels, coefficients, labels, within, F32(near), F32(weight), fill, margin, low, high, pulled, applied)
     return pulled, applied
 
 
@@ -111,7 +112,7 @@ def _move_near(matches, median, near, moved):
 
 
 @kernel
-def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high, pulled, applied):
+def _pull(pixels, coefficients, labels, within, near, weight, fill, margin, low, high, pulled, applied):
     height, width = pixels.shape
     for y in range(height):
         row = pixels[y]
@@ -132,14 +133,15 @@ def _pull(pixels, coefficients, labels, within, near, weight, margin, low, high,
                 hidden = last >= 0 and after < width and row[after] - row[last] >= MIN_SURFACE_STEP
                 ceiling = F32(0.5) * (row[last] + row[after]) if hidden else high
             reached = y >= within.top[x] - margin and x >= within.first[y] - margin and x <= within.last[y] + margin
-            sane = margin >= 0 and reached and plane >= low and plane <= ceiling
+            sane = fill and reached and plane >= low and plane <= ceiling
             pulled[y, x] = plane if sane else d
             applied[y, x] = sane
 
 
 def pull_to_planes_reference(
-    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, margin: int
-) -> tuple[Array, Array]:
+    pixels: Array, coefficients: Array, labels: Array, within: Extent, near: float, weight: float, fill: bool,
+    margin: int,
+) -> tuple[Array, Array]:  # fmt: skip
     """`pull_to_planes` in plain numpy."""
     y, x = np.mgrid[: pixels.shape[0], : pixels.shape[1]]
     a, b, c = coefficients[labels].transpose(2, 0, 1)
@@ -148,7 +150,7 @@ def pull_to_planes_reference(
     with np.errstate(invalid="ignore"):
         close = np.abs(plane - pixels) <= F32(near)
     pulled = np.where(close, pixels + F32(weight) * (plane - pixels), pixels)
-    if margin < 0 or hole.all():
+    if not fill or hole.all():
         return pulled, close
     column = np.arange(pixels.shape[1])
     left = np.maximum.accumulate(np.where(hole, -1, column), axis=1)

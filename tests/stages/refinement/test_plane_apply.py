@@ -26,12 +26,12 @@ def scene(height, width, seed):
     return pixels, coefficients, labels
 
 
-@given(st.integers(1, 20), st.integers(1, 30), st.sampled_from([-1.0, 0.0, 3.0]), st.integers(0, 2**31))
-def test_planes_pull_and_fill_as_in_the_reference(height, width, margin, seed):
+@given(st.integers(1, 20), st.integers(1, 30), st.booleans(), st.sampled_from([0, 3]), st.integers(0, 2**31))
+def test_planes_pull_and_fill_as_in_the_reference(height, width, fill, margin, seed):
     pixels, coefficients, labels = scene(height, width, seed)
     within = extent(pixels)
-    pulled, applied = pull_to_planes(pixels, coefficients, labels, within, 2.0, 0.7, margin)
-    expected, expected_applied = pull_to_planes_reference(pixels, coefficients, labels, within, 2.0, 0.7, margin)
+    given = pixels, coefficients, labels, within, 2.0, 0.7, fill, margin
+    (pulled, applied), (expected, expected_applied) = pull_to_planes(*given), pull_to_planes_reference(*given)
     assert np.allclose(pulled, expected, atol=1e-5, equal_nan=True)
     assert np.array_equal(applied, expected_applied)
 
