@@ -54,20 +54,11 @@ def test_a_file_of_another_format_is_refused_in_one_sentence(tmp_path, refused, 
     assert roverflow("run", tmp_path / "nowhere.mcap") == 2
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ("disparity=96", "disparity.parameter=value; did you mean 'disparities'?"),
-        ("rover.max_slope=95deg", "must be at most 89 deg, not 95deg"),
-        ("disparities=", "--set disparities=: write stream.parameter=value, or setting=value"),
-        ("settings.disparities=64", "a setting has no prefix; write disparities=value"),
-        ("disparity/half/quarter.search_radius=4", "quarter': Match.search_radius = 4 px needs a `prior`"),
-    ],
-)
-def test_an_invalid_setting_is_quoted_as_written(traverse, tmp_path, said, change, words):
+def test_an_invalid_setting_is_quoted_as_written(traverse, tmp_path, said):
+    words = ("run", traverse, "--set", "rover.max_slope=95deg", "-o", tmp_path / "out.mcap")
     for more in ((), ("--debug",)):  # which shows the way there, and changes no exit code
-        printed = said(2, "run", traverse, "--set", change, "-o", tmp_path / "out.mcap", *more).err
-        assert words in printed.splitlines()[-1]
+        printed = said(2, *words, *more).err
+        assert "must be at most 89 deg, not 95deg" in printed.splitlines()[-1]
         assert ("Traceback" in printed) == bool(more)
     assert not list(tmp_path.iterdir())
 
@@ -228,25 +219,13 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeyp
     assert roverflow("export", result, folder) == 0
 
 
-SIZES = "--slope", "--tilt-noise", "--odometry-turn", "--rocks"
-
-
 @pytest.mark.parametrize(
     ("option", "value", "printed"),
     [
         ("--slope", "80", "--slope must be at most 45 deg, not 80 deg"),
-        ("--rocks", "2", "--rocks must be at most 0.5, not 2"),
         ("--size", "1x20", "the width of --size must be at least 16 px, not 1 px"),
-        ("--baseline", "0", "--baseline must be at least 0.1 cm, not 0 m"),
-        ("--baseline", "1e9", "--baseline must be at most 10 m"),
-        ("--camera-height", "0.01", "--camera-height must be at least 10 cm, not 1 cm"),
-        ("--pitch-down", "120", "--pitch-down must be at most 90 deg, not 120 deg"),
-        ("--frames", "9" * 20, "--frames must be at most 100000, not"),
-        ("--seed", "-1", "--seed must be at least 0, not -1"),
-        ("--tilt-noise", "400", "--tilt-noise must be at most 45 deg, not 400 deg"),
         ("--odometry-scale", "300", "--odometry-scale must be at most 100 %, not 300 %"),
-        *((option, "-1", rf"^roverflow: {option} must be at least 0.*, not -1") for option in SIZES),
-        *((option, "nan", f"{option} must be a finite number") for option in (*SIZES, "--odometry-scale")),
+        ("--rocks", "nan", "--rocks must be a finite number"),
     ],
 )
 def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, refused, option, value, printed):

@@ -13,7 +13,6 @@ import pytest
 from distributed import Client
 
 from recordings.simulator import Simulation, write_log
-from tests.conftest import roverflow
 from tests.fleet.test_fleet import PIPELINE, rows_of
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -84,19 +83,6 @@ def ended(home: Path, out: Path, *more: object) -> str:
 def times(out: Path) -> dict[str, int]:
     done = [name for name, row in rows_of(out).items() if row["state"] == "done"]
     return {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done}
-
-
-@pytest.mark.slow
-def test_processes_and_clusters_write_the_bytes_of_run(home, tmp_path):
-    for processes in (1, 2):
-        ended(home, tmp_path / f"out{processes}", "--processes", processes, "--workers-per-log", 1)
-    with cluster(18786) as (address, _):
-        ended(home, tmp_path / "cluster", "--cluster", address)
-    for log in sorted(home.glob("*.mcap")):
-        assert roverflow("run", log, *PIPELINE, "--no-rrd", "-o", tmp_path / "plain.mcap") == 0
-        plain = (tmp_path / "plain.mcap").read_bytes()
-        for out in ("out1", "out2", "cluster"):
-            assert (tmp_path / out / f"{log.stem}-nav.mcap").read_bytes() == plain, (out, log.stem)
 
 
 @pytest.mark.slow
