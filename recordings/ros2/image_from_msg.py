@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.video.formats import unread_video
 from stages.data import Array
 
 # Encoding -> (dtype, channels in the message, conversion to gray or RGB)
@@ -57,16 +56,6 @@ def pixels_of(message: Any, size: tuple[int, int] | None = None, max_pixels: int
     return read(message, size, max_pixels)
 
 
-def unread_encoding(message: Any) -> str:
-    """A sentence about an unsupported image or video encoding; empty for other messages."""
-    if hasattr(message, "video_format"):
-        return unread_video(message.video_format)
-    encoding = getattr(message, "encoding", None)
-    if encoding is None or encoding in _ALL_ENCODINGS:
-        return ""
-    return f"the image encoding '{encoding}' is not supported; record it in one of {', '.join(_ALL_ENCODINGS)}"
-
-
 def check_size(width: int, height: int, size: tuple[int, int] | None, max_pixels: int) -> None:
     """Raise LogError for an image that is empty, too large, or of another size than `size`."""
     if width == 0 or height == 0:
@@ -78,8 +67,9 @@ def check_size(width: int, height: int, size: tuple[int, int] | None, max_pixels
 
 
 def _raw_pixels(message: Any, size: tuple[int, int] | None, max_pixels: int) -> Array:
-    if unread := unread_encoding(message):
-        raise LogError(unread)
+    if message.encoding not in _ALL_ENCODINGS:
+        known = ", ".join(_ALL_ENCODINGS)
+        raise LogError(f"the image encoding '{message.encoding}' is not supported; record it in one of {known}")
     luma = _LUMA.get(message.encoding)
     kind, channels, conversion = ("u1", luma[0], None) if luma else _ENCODINGS[message.encoding]
     height, width, data = int(message.height), int(message.width), np.asarray(message.data, np.uint8)

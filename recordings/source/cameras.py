@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from recordings.errors import LogError
 from recordings.ros2.from_msg import camera_model, frame_of, stamp_or
-from recordings.ros2.image_from_msg import unread_encoding
 from recordings.source.calibration import Camera
 from recordings.source.topics import DecodedTopics
 from recordings.video.decoder import PixelReader, VideoDecoder
 from stages.data import Array, CameraImage, CameraModel
 
 CAMERAS = ("left", "right")
+_MAX_LOOKED_AT = 1000  # images, to find one that can be read; a video may begin that far before its key frame
 
 
 @dataclass(frozen=True)
@@ -102,16 +103,6 @@ def first_calibrations(
     return infos, unread
 
 
-def unreadable_images(messages: DecodedTopics, topics: Mapping[str, str], sides: Collection[str]) -> dict[str, str]:
-    """Side -> why its images cannot be read, by the encoding of the first one. topics: side -> topic of its images."""
-    unread = dict[str, str]()
-    for side in sides:
-        why = messages.first(topics[side], unread_encoding)
-        if why and not isinstance(why, LogError):
-            unread[side] = f"{topics[side]}: {why}"
-    return unread
-
-
 def mismatched_images(
     messages: DecodedTopics, topics: Mapping[str, str], infos: Mapping[str, CalibrationTopic]
 ) -> dict[str, str]:
@@ -130,7 +121,7 @@ def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | 
     """The first (or last) image that can be decoded, or the last error; None without messages."""
     found, pixels_of = None, messages.pixel_reader(topic)
     some = messages.each if isinstance(pixels_of, VideoDecoder) else messages.last if last else messages.sample
-    for found in some(topic, pixels_of):
+    for found in islice(some(topic, pixels_of), _MAX_LOOKED_AT):
         if not isinstance(found, LogError):
             break
     return found

@@ -17,7 +17,7 @@ from recordings.inertial.imu_content import ImuContent, imu_content
 from recordings.inertial.up_estimator import UpEstimator
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
-from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images, unreadable_images
+from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images
 from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
 from recordings.source.moving_mount import MovingMount, moving_mount, other_joints
@@ -65,8 +65,6 @@ class SourceResolution:
         self.refused |= found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
         self.refused |= self._fixed_rotation()
         unavailable |= unmounted | moving
-        there = [side for side in CAMERAS if side in found.chosen and side not in unavailable]
-        unavailable |= unreadable_images(self.messages, found.chosen, there)
         if all(side in self.infos and side not in unavailable for side in CAMERAS):
             unavailable |= mismatched_images(self.messages, found.chosen, self.infos)
         self.unavailable = unavailable
