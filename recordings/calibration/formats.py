@@ -148,11 +148,10 @@ _ROS_NAMES = {
 # OpenCV's samples, its calibration tools and others that write with its FileStorage.
 _OPENCV_NAMES: dict[str, tuple[tuple[str, str], ...]] = {
     "K": (("M1", "M2"), ("K1", "K2"), ("cameraMatrix1", "cameraMatrix2"), ("camera_matrix_1", "camera_matrix_2"),
-          ("left_camera_matrix", "right_camera_matrix"), ("camera_matrix_left", "camera_matrix_right"),
-          ("LEFT.K", "RIGHT.K")),
+          ("left_camera_matrix", "right_camera_matrix"), ("camera_matrix_left", "camera_matrix_right")),
     "D": (("D1", "D2"), ("distCoeffs1", "distCoeffs2"), ("dist_coeffs_1", "dist_coeffs_2"),
           ("left_distortion_coefficients", "right_distortion_coefficients"),
-          ("distortion_coefficients_left", "distortion_coefficients_right"), ("LEFT.D", "RIGHT.D")),
+          ("distortion_coefficients_left", "distortion_coefficients_right")),
 }  # fmt: skip
 _ROTATIONS, _TRANSLATIONS = ("R", "rotation_matrix", "rotation"), ("T", "translation_vector", "translation")
 

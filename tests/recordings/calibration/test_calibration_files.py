@@ -112,6 +112,25 @@ def test_opencv_files_are_read_as_opencv_writes_them(tmp_path):
     assert (calibration.models[0].width, calibration.camera_from_imu) == (0, None)
 
 
+@pytest.mark.parametrize(
+    ("of_k", "of_d", "turn", "shift"),
+    [
+        ("K{n}", "D{n}", "R", "T"),
+        ("cameraMatrix{n}", "distCoeffs{n}", "rotation", "translation"),
+        ("camera_matrix_{n}", "dist_coeffs_{n}", "rotation_matrix", "translation_vector"),
+        ("{side}_camera_matrix", "{side}_distortion_coefficients", "R", "T"),
+        ("camera_matrix_{side}", "distortion_coefficients_{side}", "R", "T"),
+    ],
+)
+def test_opencv_files_may_have_the_names_of_other_tools(tmp_path, of_k, of_d, turn, shift):
+    left_to_right = np.linalg.inv(RIGHT_IN_LEFT)
+    content = {turn: left_to_right[:3, :3].tolist(), shift: left_to_right[:3, 3].tolist()}
+    for n, side in enumerate(("left", "right")):
+        content[of_k.format(n=n + 1, side=side)] = K[n].tolist()
+        content[of_d.format(n=n + 1, side=side)] = np.asarray(D[n]).tolist()
+    check(read_calibration([written(tmp_path / "stereo.yaml", content)]))
+
+
 def camera_info(name: str, shift: float) -> dict[str, Any]:
     matrix = {"rows": 3, "cols": 3, "data": [20.0, 0, 11.5, 0, 20.0, 7.5, 0, 0, 1]}
     return {
