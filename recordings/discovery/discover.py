@@ -6,7 +6,7 @@ names them and the setting that decides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from recordings.discovery.images import find_images, find_info
 from recordings.discovery.roles import (
@@ -21,24 +21,19 @@ from recordings.discovery.roles import (
     not_there,
 )  # fmt: skip
 from recordings.discovery.tilt import find_tilt
-from recordings.inertial.imu_content import ImuContent
+from recordings.errors import LogError
+from recordings.ros2.from_msg import frame_name, frame_of
 from recordings.source.settings import LogSettings
+from recordings.source.topics import DecodedTopics
 
+_MAX_TRANSFORMS = 200  # messages of each part of a log that are looked at, as many place other frames
+_MAX_LISTED = 5  # frames in a sentence
 _TRUTH = "/truth/"  # the simulator's ground truth, used only if a setting names it
 
 
-def discover(
-    topics: Sequence[Topic],
-    settings: LogSettings,
-    frame_of: Callable[[str], str],
-    content_of: Callable[[str], ImuContent],
-    no_pose_reason: Callable[[str], str | None],
-) -> DiscoveredTopics:
-    """Find the topic of each role.
-
-    settings: the topics named by the user; frame_of: topic -> the frame_id of its messages; content_of: Imu topic ->
-    what its messages contain; no_pose_reason: topic of transforms -> why they are not the rover's pose.
-    """
+def discover(messages: DecodedTopics, settings: LogSettings) -> DiscoveredTopics:
+    """Find the topic of each role. settings: the topics named by the user."""
+    topics = [Topic(name, schema, messages.count(name)) for name, schema in sorted(messages.schemas.items())]
     named = (
         settings.left, settings.right, settings.left_info, settings.right_info, settings.inclinometer,
         settings.gyroscope, settings.odometry,
@@ -49,22 +44,22 @@ def discover(
     find_images(topics, settings, found)
     for side in ("left", "right"):
         if side in found.chosen and settings.calibration is None:
-            find_info(topics, settings, side, frame_of, found)
-    find_tilt(topics, settings, content_of, found)
+            find_info(topics, settings, side, messages, found)
+    find_tilt(topics, settings, messages, found)
     poses = [
         topic for topic in topics if topic.schema in POSES and topic.messages and not topic.name.startswith(RESULTS)
     ]
     if "inclinometer" in found.missing:
         for topic in poses:
-            frame = frame_of(topic.name)
+            frame = messages.frame_of(topic.name)
             upright = Remedy({"inclinometer": topic.name, "upright_frame": frame}, f"if z of '{frame}' points up")
             found.remedies.setdefault("inclinometer", []).append(upright)
-    _find_pose(topics, settings, no_pose_reason, found)
+    _find_pose(topics, settings, messages, found)
     return found
 
 
 def _find_pose(
-    topics: Sequence[Topic], settings: LogSettings, no_pose_reason: Callable[[str], str | None], found: DiscoveredTopics
+    topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
 ) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
     if settings.odometry is not None:
@@ -72,7 +67,7 @@ def _find_pose(
         candidates = poses + [topic for topic in moving if topic.messages]
         if settings.odometry not in {topic.name for topic in candidates}:
             found.refuse("odometry", "odometry", not_there("odometry", settings.odometry, "pose", candidates))
-        elif settings.odometry in {topic.name for topic in moving} and (why := no_pose_reason(settings.odometry)):
+        elif settings.odometry in {topic.name for topic in moving} and (why := _no_pose_reason(messages, settings)):
             found.refuse("odometry", "odometry", f"the source's 'odometry' is set to {settings.odometry}, where {why}")
         else:
             found.chosen["odometry"], found.why["odometry"] = settings.odometry, "as set"
@@ -87,3 +82,25 @@ def _find_pose(
         other = f" (there is {names_of(poses)}; set 'odometry' of the source to use it)" if poses else ""
         found.offer("odometry", "odometry", [topic.name for topic in poses if not topic.name.startswith(RESULTS)])
         found.missing["odometry"] = f"the log has no nav_msgs/Odometry from a sensor{other}"
+
+
+def _no_pose_reason(messages: DecodedTopics, settings: LogSettings) -> str | None:
+    """Why the transforms on the set topic are not the pose of the base frame; None if they are."""
+    base, parents = settings.base_frame, dict[str, set[str]]()
+    for message in messages.sample(str(settings.odometry), lambda message: message.transforms, _MAX_TRANSFORMS):
+        for item in [] if isinstance(message, LogError) else message:
+            parents.setdefault(frame_name(item.child_frame_id), set()).add(frame_of(item))
+    if base not in parents:
+        others = ", ".join(f"'{child}'" for child in sorted(parents)[:_MAX_LISTED]) or "nothing"
+        return f"no transform places '{base}' (they place {others}); set 'base_frame' of the source to the rover's"
+    first, *more = sorted(parents[base])
+    if more:
+        return f"'{base}' has two parents, '{first}' and '{more[0]}'; record the pose as Odometry"
+    # map <- odom <- base_link is the one chain (REP 105) in which the last link alone is a pose.
+    if first in parents and first.rpartition("/")[2] != "odom":
+        above = min(parents[first])
+        return (
+            f"'{base}' is placed in '{first}', and that in '{above}'; set 'base_frame' of the source to '{first}' "
+            "if that is the rover's frame, or record the pose as Odometry"
+        )
+    return None

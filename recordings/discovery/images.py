@@ -7,11 +7,12 @@ the other.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import takewhile
 
 from recordings.discovery.roles import IMAGES, INFO, DiscoveredTopics, Remedy, Topic, names_of, not_there
 from recordings.source.settings import LogSettings
+from recordings.source.topics import DecodedTopics
 
 # (pattern of the left side in a topic's name, replacement for the right side)
 SIDES = (
@@ -84,7 +85,7 @@ def find_images(topics: Sequence[Topic], settings: LogSettings, found: Discovere
 
 
 def find_info(
-    topics: Sequence[Topic], settings: LogSettings, side: str, frame_of: Callable[[str], str], found: DiscoveredTopics
+    topics: Sequence[Topic], settings: LogSettings, side: str, messages: DecodedTopics, found: DiscoveredTopics
 ) -> None:
     infos = [topic for topic in topics if topic.schema == INFO and topic.messages]
     given = getattr(settings, f"{side}_info")
@@ -102,8 +103,8 @@ def find_info(
         if name in names:
             found.chosen[f"{side}_info"] = name
             return
-    frame = frame_of(image)  # Foxglove's calibrations belong to an image by their frame alone
-    matching = [name for name in sorted(names) if frame and frame_of(name) == frame]
+    frame = messages.frame_of(image)  # Foxglove's calibrations belong to an image by their frame alone
+    matching = [name for name in sorted(names) if frame and messages.frame_of(name) == frame]
     if len(matching) == 1:
         found.chosen[f"{side}_info"] = matching[0]
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from recordings.discovery.roles import (
     BARE_TILT,
@@ -21,19 +21,18 @@ from recordings.discovery.roles import (
     names_of,
     not_there,
 )  # fmt: skip
-from recordings.inertial.imu_content import ImuContent
+from recordings.inertial.imu_content import imu_content
 from recordings.source.settings import LogSettings
+from recordings.source.topics import DecodedTopics
 
 
-def find_tilt(
-    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
-) -> None:
+def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics) -> None:
     """Find the inclinometer, and for an estimate the gyroscope."""
     topics = [topic for topic in topics if topic.messages]
     found.tilt = _kind_set(settings)
     given = settings.inclinometer
     if given is None:
-        _search_tilt(topics, settings, content_of, found)
+        _search_tilt(topics, settings, messages, found)
     else:
         topic = next((topic for topic in topics if topic.name == given), None)
         if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
@@ -45,11 +44,13 @@ def find_tilt(
             found.remedies["inclinometer"] = _meanings(topic.name)
         else:
             found.chosen["inclinometer"], found.why["inclinometer"] = given, "as set"
-            content = content_of(given) if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION else None
+            content = (
+                imu_content(messages, given) if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION else None
+            )
             if content is not None and content.no_orientation and content.accelerations:
                 found.tilt = TiltKind.ACCELERATIONS
     if "inclinometer" in found.chosen and (settings.gyroscope or found.tilt == TiltKind.ACCELERATIONS):
-        _find_gyroscope(topics, settings, content_of, found)
+        _find_gyroscope(topics, settings, messages, found)
 
 
 def _kind_set(settings: LogSettings) -> TiltKind:
@@ -70,7 +71,7 @@ def _schemas_of(kind: TiltKind, schema: str) -> tuple[str, ...]:
 
 
 def _search_tilt(
-    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+    topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
 ) -> None:
     """Find the inclinometer without a setting of its topic."""
     bare = [topic for topic in topics if topic.schema == BARE_TILT]
@@ -80,7 +81,7 @@ def _search_tilt(
     }.get(found.tilt, bare)
     choice, why = candidates, ""
     if found.tilt == TiltKind.ORIENTATION:
-        contents = {topic.name: content_of(topic.name) for topic in candidates if topic.schema == IMU}
+        contents = {topic.name: imu_content(messages, topic.name) for topic in candidates if topic.schema == IMU}
         unoriented = {name: content.no_orientation for name, content in contents.items() if content.no_orientation}
         choice = [topic for topic in candidates if topic.name not in unoriented]
         why = next(iter(unoriented.values()), "")
@@ -111,7 +112,7 @@ def _search_tilt(
 
 
 def _find_gyroscope(
-    topics: Sequence[Topic], settings: LogSettings, content_of: Callable[[str], ImuContent], found: DiscoveredTopics
+    topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
 ) -> None:
     """Find the rates that go with the accelerations; without any, up is that of each acceleration."""
     imus, own = [topic for topic in topics if topic.schema == IMU], found.chosen["inclinometer"]
@@ -119,9 +120,9 @@ def _find_gyroscope(
         if settings.gyroscope not in {topic.name for topic in imus}:
             found.refuse("inclinometer", "gyroscope", not_there("gyroscope", settings.gyroscope, "Imu", imus))
             return
-        if settings.accelerations is None and not _accelerates(own, imus, content_of):
-            own = next((name for name in (settings.gyroscope,) if settings.inclinometer is None), own)
-            if not _accelerates(own, imus, content_of):
+        if settings.accelerations is None and not _accelerates(own, imus, messages):
+            own = settings.gyroscope if settings.inclinometer is None else own
+            if not _accelerates(own, imus, messages):
                 why = f"{own} has no accelerations to go with the rates; set 'inclinometer' to the Imu that has them"
                 found.refuse("inclinometer", "gyroscope", f"'gyroscope' of the source is set, but {why}")
                 del found.chosen["inclinometer"]
@@ -131,7 +132,7 @@ def _find_gyroscope(
     elif settings.accelerations is not None:
         return
     else:
-        rated = [topic.name for topic in imus if content_of(topic.name).rates]
+        rated = [topic.name for topic in imus if imu_content(messages, topic.name).rates]
         rated = [name for name in rated if name in (own, own.replace("accel", "gyro"))] or rated
         rated = [own] if own in rated else rated
     if len(rated) > 1:
@@ -145,8 +146,8 @@ def _find_gyroscope(
         found.tilt, found.chosen["gyroscope"] = TiltKind.ESTIMATE, rated[0]
 
 
-def _accelerates(name: str, imus: Sequence[Topic], content_of: Callable[[str], ImuContent]) -> bool:
-    return name in {topic.name for topic in imus} and content_of(name).accelerations
+def _accelerates(name: str, imus: Sequence[Topic], messages: DecodedTopics) -> bool:
+    return name in {topic.name for topic in imus} and imu_content(messages, name).accelerations
 
 
 def _undefined(topic: Topic) -> str:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from recordings.errors import LogError
 from recordings.ros2.tilt_from_msg import acceleration_of, rate_of, tilt_of
-from recordings.source.topics import attempt
+from recordings.source.topics import DecodedTopics, attempt
 from stages.data import Array
 
 MIN_GRAVITY = 0.3  # m/s^2, of a mean acceleration; less is a bias of the sensor
@@ -28,13 +26,13 @@ class ImuContent:
     rates: bool
 
 
-def imu_content(messages: Iterable[Any | LogError]) -> ImuContent:
-    """What some messages of an Imu contain.
+def imu_content(messages: DecodedTopics, topic: str) -> ImuContent:
+    """What the messages of an Imu contain, by a sample.
 
     An orientation that is 1 in all of several messages with accelerations is a default of the driver.
     """
     why, seen, forces, rates = "it has no messages", list[tuple[float, ...]](), list[tuple[float, ...]](), False
-    for message in messages:
+    for message in messages.sample(topic, lambda message: message):
         if isinstance(message, LogError):
             why = str(message)
             continue

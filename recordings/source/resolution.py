@@ -11,9 +11,9 @@ from flow.contracts import Finding, counted
 from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
 from recordings.discovery.discover import discover
-from recordings.discovery.roles import IMU, TRANSFORMS, DiscoveredTopics, Remedy, TiltKind, Topic
+from recordings.discovery.roles import IMU, TRANSFORMS, DiscoveredTopics, Remedy, TiltKind
 from recordings.errors import LogError
-from recordings.inertial.imu_content import ImuContent, imu_content
+from recordings.inertial.imu_content import imu_content
 from recordings.inertial.up_estimator import UpEstimator
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
@@ -28,7 +28,6 @@ from recordings.source.transforms import TransformTree, are_same
 from stages.data import LEVEL_FRAME, Mount, Pose
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
-_MAX_TRANSFORMS = 200  # messages of each part of a log that are looked at, as many place other frames
 _MAX_LISTED = 5  # topics in a sentence
 
 
@@ -125,9 +124,7 @@ class SourceResolution:
 
     def _discovered(self) -> DiscoveredTopics:
         """The topic of each role, and why other roles have none."""
-        schemas, angles = self.messages.schemas, self.source.angles()
-        topics = [Topic(name, schemas[name], self.messages.count(name)) for name in sorted(schemas)]
-        found = discover(topics, self.source, self.messages.frame_of, self._content_of, self._no_pose_reason)
+        angles, found = self.source.angles(), discover(self.messages, self.source)
         check = self.source.accelerations if angles is None else angles.check
         if check is not None and (topic := found.chosen.get("inclinometer")):
             checked = self.messages.first(topic, check)
@@ -254,10 +251,6 @@ class SourceResolution:
                 lost.append((streams[topic], LogError(what)))
         return lost
 
-    def _content_of(self, topic: str) -> ImuContent:
-        """What the messages of an Imu contain, by a sample."""
-        return imu_content(self.messages.sample(topic, lambda message: message))
-
     def _tilt_reading(self, found: DiscoveredTopics) -> tuple[TiltReading | None, dict[str, str]]:
         """How the tilt is read, and why it cannot be."""
         topic, gyroscope = found.chosen.get("inclinometer"), found.chosen.get("gyroscope", "")
@@ -274,7 +267,7 @@ class SourceResolution:
                 return None, {"inclinometer": why}
             turn = transform.rotation
         is_imu = self.messages.schemas[topic] == IMU and self.source.accelerations is None
-        why = self._content_of(topic).no_orientation if is_imu and found.tilt != TiltKind.ORIENTATION else ""
+        why = imu_content(self.messages, topic).no_orientation if is_imu and found.tilt != TiltKind.ORIENTATION else ""
         return TiltReading(found.tilt, topic, gyroscope, turn, why), {}
 
     def _inclinometer_frame(self, topic: str) -> str:
@@ -284,27 +277,6 @@ class SourceResolution:
             return self.messages.frame_of(topic) or own
         pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
         return "" if isinstance(pose, LogError) else pose.child_frame_id
-
-    def _no_pose_reason(self, topic: str) -> str | None:
-        """Why the transforms of a topic are not the pose of the base frame; None if they are."""
-        base, parents = self.source.base_frame, dict[str, set[str]]()
-        for message in self.messages.sample(topic, lambda message: message.transforms, _MAX_TRANSFORMS):
-            for item in [] if isinstance(message, LogError) else message:
-                parents.setdefault(frame_name(item.child_frame_id), set()).add(frame_of(item))
-        if base not in parents:
-            others = ", ".join(f"'{child}'" for child in sorted(parents)[:_MAX_LISTED]) or "nothing"
-            return f"no transform places '{base}' (they place {others}); set 'base_frame' of the source to the rover's"
-        first, *more = sorted(parents[base])
-        if more:
-            return f"'{base}' has two parents, '{first}' and '{more[0]}'; record the pose as Odometry"
-        # map <- odom <- base_link is the one chain (REP 105) in which the last link alone is a pose.
-        if first in parents and first.rpartition("/")[2] != "odom":
-            above = min(parents[first])
-            return (
-                f"'{base}' is placed in '{first}', and that in '{above}'; set 'base_frame' of the source to '{first}' "
-                "if that is the rover's frame, or record the pose as Odometry"
-            )
-        return None
 
 
 def _pose_of(message: Any, base_frame: str) -> Pose:

@@ -143,7 +143,7 @@ def test_transforms_with_no_pose_or_two_are_refused(tmp_path, links, sentence):
 
 def test_a_topic_that_supplies_nothing_is_judged_by_a_sample(tmp_path, monkeypatch):
     path, seen = moving(tmp_path / "log.mcap", WHEEL, count=2000), []
-    monkeypatch.setattr("recordings.source.resolution.frame_name", lambda name: seen.append(name) or name)
+    monkeypatch.setattr("recordings.discovery.discover.frame_name", lambda name: seen.append(name) or name)
     with McapSource(odometry="/tf").open(path) as log:
         assert "no transform places 'base_link'" in log.refused["odometry"]
         assert len(seen) <= 800
