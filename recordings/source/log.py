@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from functools import partial
 from heapq import merge
-from itertools import chain, islice
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -112,7 +112,7 @@ class McapLog:
     def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
         """The events of a few frames at `count` places of the whole log, independent of the range that is read."""
         times = self.file.times(self.channels("left")).tolist() if "left" in self.topics else []
-        ahead = self._stamps_ahead() if set(streams) <= {*CAMERAS} else INTERPOLATION_LEAD_NS
+        ahead = MAX_JITTER_NS if set(streams) <= {*CAMERAS} else INTERPOLATION_LEAD_NS
         for first in sorted({int((part + 0.5) * len(times) / count) for part in range(count)}) if times else ():
             last = min(first + EXCERPT_FRAMES, len(times)) - 1
             # Stamps precede log times, so begin after the previous image.
@@ -120,18 +120,10 @@ class McapLog:
             part = TimeRange(low, times[last] + MAX_LATENESS_NS)
             yield self._between(part, FramesInRange(part, ()), streams, ahead)
 
-    def _stamps_ahead(self) -> int:
-        """By how much, ns, stamps of images may be later than their log times: so much earlier they are looked for."""
-        raws = [
-            raw for side in CAMERAS if side in self.topics for raw in islice(self.file.messages(self.channels(side)), 1)
-        ]
-        ahead = (self.stamp_of(raw) - raw.log_time for raw in raws if isinstance(raw, RawMessage))
-        return min(max(*ahead, 0, 0) + MAX_JITTER_NS, MAX_LATENESS_NS)
-
     def _lefts_around(self, part: TimeRange) -> Iterator[tuple[int, int]]:
         """Stamp and log time, ns, of the left images around the edges of a part."""
         for edge in part.edges if "left" in self.topics else ():
-            for raw in self.file.messages(self.channels("left"), edge - EDGE_NS // 10, edge + EDGE_NS):
+            for raw in self.file.messages(self.channels("left"), edge - MAX_JITTER_NS, edge + EDGE_NS):
                 if isinstance(raw, RawMessage):
                     yield self.stamp_of(raw), raw.log_time
 
