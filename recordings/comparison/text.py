@@ -53,18 +53,13 @@ def _line(item: TopicDiff) -> str:
     sizes = [name for name in item.worst if name.startswith(("median ", "largest "))]
     counts = [name for name in item.worst if name not in (*layers[1:], *sizes)]
     number = {name: f"{value:.0f}" if value >= 100 else f"{value:.2g}" for name, value in item.worst.items()}
-    first, *rest = [f"{number[name]} {_singular(name) if item.worst[name] == 1 else name}" for name in counts] or [""]
+    named = {name: name.replace("s", "", 1) if item.worst[name] == 1 else name for name in counts}  # 1 pixel
+    first, *rest = [f"{number[name]} {text}" for name, text in named.items()] or [""]
     largest = [f"{what} {number[name]} {unit}" for name in sizes for what, _, unit in [name.rpartition(" ")]]
     parts += [", ".join([f"up to {first} a message", *rest])] if first else []
     parts += [", ".join(largest)] if largest else []
     parts += [f"{counted(len(layers) - 1, 'more layer differs', 'more layers differ')}"] if layers[1:] else []
     return "; ".join(parts)
-
-
-def _singular(measure: str) -> str:
-    """The name of a measure for one thing: "pixel known only in A"."""
-    noun, space, rest = measure.partition(" ")
-    return noun.removesuffix("s") + space + rest
 
 
 def _shown(one: str, other: str) -> str:
