@@ -12,7 +12,7 @@ import numpy as np
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.simulator import ground_truth, traverse
-from recordings.simulator.simulation import FrameTruth, Simulation
+from recordings.simulator.simulation import MAST_RATE, ODOMETRY_RATE, TILT_RATE, FrameTruth, Simulation
 from recordings.source.calibration import pinhole
 from stages.data import LEVEL_FRAME
 
@@ -42,10 +42,10 @@ def _moments(simulation: Simulation) -> Iterator[tuple[int, Callable[[], Message
     """(log time, function that makes the messages, frame index or None), unordered."""
     yield simulation.begin, partial(static_transforms, simulation), None
     raw = simulation.imu == "raw"
-    tilt = (imu, simulation.imu_rate, 4_000_000) if raw else (inclinometer, simulation.tilt_rate, 4_000_000)
-    sensors = [tilt, (odometry, simulation.odometry_rate, 9_000_000)]
+    tilt = (imu, simulation.imu_rate, 4_000_000) if raw else (inclinometer, TILT_RATE, 4_000_000)
+    sensors = [tilt, (odometry, ODOMETRY_RATE, 9_000_000)]
     if simulation.pan:
-        sensors.append((mast, simulation.mast_rate, 6_000_000))
+        sensors.append((mast, MAST_RATE, 6_000_000))
     for make_messages, rate, latency in sensors:
         for number, stamp in enumerate(simulation.sensor_stamps(rate)):
             yield stamp + latency, partial(make_messages, simulation, number, stamp), None

@@ -28,6 +28,9 @@ DAY = 86_400 * SECOND
 MAX_DAYS = 4000  # from the epoch on; limited by the 32-bit seconds of a ROS time
 SENSOR_MARGIN = SECOND // 2  # that the slow sensors run before the first frame and after the last
 GROUND = ("sand", "dust", "bedrock")  # fields whose shares are at most 1 together
+TILT_RATE, ODOMETRY_RATE, MAST_RATE = 20.0, 10.0, 20.0  # Hz, of an inclinometer, of poses, of a mast that turns
+ROCK_DIAMETERS = 0.06, 1.5  # m, of the smallest and the largest rock
+HORIZON = 300.0  # m, beyond which is sky
 ROW_BLOCK = 32  # rows of one task of a thread
 # The Devon Island rover's rectified camera (1280 pixels wide).
 DEVON_WIDTH, DEVON_F, DEVON_CX, DEVON_CY, DEVON_HEIGHT = 1280, 968.999694824, 635.139038086, 463.537109375, 960
@@ -90,8 +93,6 @@ class Simulation:
     relief_cells: int = parameter(2048, "cells along a side of the repeating ground tile")
     relief_resolution: float = parameter(0.04, "size of a cell of the ground tile", unit="m", low=0.001, high=10)
     abundance: float = _by_scene("k of Golombek's law of rocks (0.05 sparse, 0.15 dense)", low=0, high=0.5)
-    smallest_rock: float = parameter(0.06, "diameter of the smallest rock", unit="m", low=0.01, high=10)
-    largest_rock: float = parameter(1.5, "diameter of the largest rock", unit="m")
     sand: float = _by_scene("share of the ground that is sand", unit="share", low=0, high=1)
     dust: float = _by_scene("share of the ground that is dust", unit="share", low=0, high=1)
     bedrock: float = _by_scene("share of the ground that is bedrock; the rest is gravel", unit="share", low=0, high=1)
@@ -119,7 +120,6 @@ class Simulation:
     exposure_time: float = parameter(0.0, "time of an exposure, for motion blur", unit="s", low=0, high=1)
     jpeg: int | None = parameter(None, "quality of compressed images; None: not compressed", low=1, high=100)
     tilt_noise: float = parameter(_rad(0.1), "one sigma of a tilt sample", unit="rad", low=0, high=_rad(45))
-    tilt_rate: float = parameter(20.0, "tilt samples per second", unit="Hz", low=1, high=1000)
     imu: str = parameter(
         "orientation", "what the inclinometer logs: its orientation; raw: accelerations and rates of a MEMS sensor",
         choices=("orientation", "raw"),
@@ -129,7 +129,6 @@ class Simulation:
         0.5, "vibration of a raw Imu while the rover drives, RMS of each axis", unit="m/s^2", low=0, high=50
     )
     rest: float = parameter(0.0, "time that the rover stands still before it drives", unit="s", low=0, high=3600)
-    odometry_rate: float = parameter(10.0, "poses per second", unit="Hz", low=1, high=1000)
     odometry_scale: float = parameter(
         0.01, "share by which odometry overstates distances; exact for 0, with odometry_turn 0", unit="share",
         low=-0.5, high=1,
@@ -145,9 +144,7 @@ class Simulation:
         0.0, "largest turn of the mast with the cameras, to the left and to the right", unit="rad", low=0, high=_rad(90)
     )
     pan_time: float = parameter(8.0, "time in which the mast turns to both sides and back", unit="s", low=0.1, high=1e4)
-    mast_rate: float = parameter(20.0, "transforms of a mast that turns, per second", unit="Hz", low=1, high=1000)
     region: float = parameter(8.0, "largest distance of a visible cell", unit="m")
-    horizon: float = parameter(300.0, "distance beyond which is sky", unit="m")
     seed: int = parameter(1, "seed of the random numbers", low=0, high=10**15)
     threads: int = parameter(2, "threads of the computation; the result does not depend on it", low=1, high=1024)
 
@@ -187,9 +184,8 @@ class Simulation:
     def terrain(self) -> Terrain:
         """The ground and its rocks, without those in the path of the rover."""
         terrain = make_terrain(
-            self._rng(0), self.relief_cells, self.relief_resolution, self.slope, self.abundance, self.smallest_rock,
-            self.largest_rock,
-        )  # fmt: skip
+            self._rng(0), self.relief_cells, self.relief_resolution, self.slope, self.abundance, *ROCK_DIAMETERS
+        )
         path = self.route.place_at(np.arange(-self.speed, self.speed * (self.frames / self.rate + 1) + 1, 0.1))
         return terrain.cleared(path, half_width=traverse.BODY_WIDTH / 2 + 0.1, height=0.12)
 
@@ -255,7 +251,7 @@ class Simulation:
     @cached_property
     def odometry(self) -> tuple[Pose, ...]:
         """The odometry of the whole drive, as logged."""
-        stamps = self.sensor_stamps(self.odometry_rate)
+        stamps = self.sensor_stamps(ODOMETRY_RATE)
         distances = np.array([self.distance(stamp) for stamp in stamps])
         bases = [self.base_at(stamp) for stamp in stamps]
         return tuple(dead_reckoning(stamps, bases, distances, self.odometry_scale, self.odometry_turn, self._rng(5)))
@@ -322,7 +318,7 @@ class Simulation:
         def render(rows: slice) -> None:
             view = pose.translation, pose.rotation, *self._intrinsics(row_offset)
             hits = depth[rows], surface[rows], facet[rows]
-            raycast.cast_rows(self.terrain.scene, *view, self.horizon, rows.start, *hits)
+            raycast.cast_rows(self.terrain.scene, *view, HORIZON, rows.start, *hits)
             shading.shade_rows(
                 self.terrain.scene, self.texture, self.sun, self.skylight, *view, rows.start, *hits,
                 radiance[rows], kind[rows],

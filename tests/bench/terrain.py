@@ -33,7 +33,7 @@ from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import ground_truth, traverse
 from recordings.simulator.scenes import SCENES
-from recordings.simulator.simulation import FrameTruth, Simulation
+from recordings.simulator.simulation import TILT_RATE, FrameTruth, Simulation
 from recordings.source.tilt_noise import WINDOW, TiltNoise
 from stages.data import Array, Cell, Disparity, Mount, PixelOrigin, StereoFrame, Tilt, Transform
 
@@ -88,10 +88,10 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
 
 def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     """The tilt as the pipeline's own aligner makes it of the inclinometer's samples about a frame."""
-    number = int((stamp - simulation.begin) * 1e-9 * simulation.tilt_rate)
+    number = int((stamp - simulation.begin) * 1e-9 * TILT_RATE)
     samples, noise = deque[Token](), TiltNoise()
     for sample in range(max(number - WINDOW, 0), number + TILT_SAMPLES + 1):
-        at = simulation.begin + round(sample / simulation.tilt_rate * 1e9)
+        at = simulation.begin + round(sample / TILT_RATE * 1e9)
         samples.append(Token(at, noise(Tilt(at, measured_up(simulation, sample, at)))))
     aligner = next(node.actor for node in nodes(pipeline) if node.name == "tilt")
     tilt = aligner.choose("tilt", "inclinometer", stamp, samples, " by the log's end")

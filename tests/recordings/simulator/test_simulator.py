@@ -15,6 +15,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.simulator import Simulation, ground_truth, raycast, terrain, traverse, write_log
 from recordings.simulator.odometry import dead_reckoning
+from recordings.simulator.simulation import HORIZON
 from stages.data import Cell, Transform
 
 SMALL = Simulation(
@@ -122,7 +123,7 @@ def test_occluded_pixels_are_those_hidden_from_the_right_camera(seen):
     surface, facet = np.empty(right.shape, np.int32), np.empty(right.shape, np.int8)
     raycast.cast_rows(
         SMALL.terrain.scene, pose.translation, pose.rotation, SMALL.camera.fx, SMALL.camera.fy, SMALL.camera.cx,
-        SMALL.camera.cy, SMALL.horizon, 0, right, surface, facet,
+        SMALL.camera.cy, HORIZON, 0, right, surface, facet,
     )  # fmt: skip
     v, u = np.nonzero(np.isfinite(seen.depth))
     depth, mask = seen.depth[v, u], seen.seen[v, u]
