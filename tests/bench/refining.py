@@ -1,4 +1,4 @@
-"""Refinement beside its alternatives: time of its parts and of the whole chain, accuracy of the pipelines.
+"""Matching and refinement beside their alternatives: time of the whole chain, accuracy of the pipelines.
 
 Run as `python -m tests.bench.refining`. Times are medians of interleaved rounds in one process, on two threads, of a
 1280x960 colour frame with 192 disparities. Accuracy is that of the pipelines as they ship, over what the code that
@@ -21,16 +21,12 @@ import numpy as np
 
 from flow.config.loader import load
 from flow.runtime.malloc import keep_freed_memory
-from stages import Disparity, Match, StereoFrame
+from stages import Disparity, StereoFrame
 from stages.data import Array
-from stages.refinement.kernels.plane_fit import fit_planes
-from stages.refinement.kernels.slic import superpixels
 from tests.bench.matching import colour_pair, medians
 from tests.bench.stereo_scores import errors, load_scene
 
 DISPARITIES = 192
-SUPERPIXELS = 4000
-SAMPLE = 200  # superpixels that scikit-image fits a plane to; the time of all is extrapolated
 ROUNDS = 5
 # Errors of the released code, measured with it: bad-0.5, 1, 2 of pixels that both cameras see, of all; RMS of all.
 RELEASED = {
@@ -89,64 +85,13 @@ def scenes(folder: Path) -> Iterator[tuple[str, StereoFrame, Array, Array, int]]
         yield scene.name, *load_scene(scene)
 
 
-def segment_points(disparity: Array, labels: Array) -> list[Array]:
-    """The known points of every segment, (n, 3) each: x, y and disparity."""
-    y, x = np.nonzero(np.isfinite(disparity))
-    points = np.stack([x, y, disparity[y, x]], axis=1)
-    order = np.argsort(labels[y, x], kind="stable")
-    sizes = np.bincount(labels[y, x], minlength=labels.max() + 1)
-    return np.split(points[order], np.cumsum(sizes)[:-1])
-
-
-def ransac_loop(segments: list[Array]) -> None:
-    """The planes of segments by scikit-image, from their listed points."""
-    from skimage.measure import ransac
-
-    for points in segments:
-        if len(points) >= 6:
-            ransac(points, _Plane, 3, 0.5, max_trials=64, rng=0)
-
-
-class _Plane:
-    """d = a x + b y + c, a model for `skimage.measure.ransac`."""
-
-    def estimate(self, points: Array) -> bool:
-        system = np.column_stack([points[:, :2], np.ones(len(points))])
-        self.params, _, rank, _ = np.linalg.lstsq(system, points[:, 2], rcond=None)
-        return bool(rank == 3)
-
-    @classmethod
-    def from_estimate(cls, points: Array) -> _Plane | None:
-        plane = cls()
-        return plane if plane.estimate(points) else None
-
-    def residuals(self, points: Array) -> Array:
-        return np.abs(points[:, :2] @ self.params[:2] + self.params[2] - points[:, 2])  # type: ignore[no-any-return]
-
-
 def speed() -> None:
     """Print times and ratios, in a process that keeps its memory as a run does."""
-    from skimage.segmentation import slic
-
     keep_freed_memory()
     frame = colour_pair()
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.left, frame.right)]
     matcher = cv2.StereoSGBM.create(0, DISPARITIES, 5, 4 * 25, 38 * 25, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
-    matched = Match(disparities=DISPARITIES, threads=2)(frame)
-    labels, count = superpixels(frame.left, SUPERPIXELS)
-    points = segment_points(
-        matched.pixels, labels
-    )  # sorted before the timing starts; our own time includes the sorting
-    sample = [points[segment] for segment in np.random.default_rng(0).choice(count, SAMPLE, replace=False)]
-    contestants: dict[str, Callable[[], object]] = {
-        "OpenCV MODE_HH, gray": lambda: matcher.compute(*gray),
-        "scikit-image SLIC": lambda: slic(frame.left, SUPERPIXELS, compactness=10, start_label=0),
-        "our SLIC": lambda: superpixels(frame.left, SUPERPIXELS, threads=2),
-        f"scikit-image RANSAC, {SAMPLE} superpixels": lambda: ransac_loop(sample),
-        "our planes, all superpixels": lambda: fit_planes(
-            matched.pixels, labels, count, hypotheses=64, weights=matched.confidence, threads=2
-        ),
-    }
+    contestants: dict[str, Callable[[], object]] = {"OpenCV MODE_HH, gray": lambda: matcher.compute(*gray)}
     for pipeline in ("accurate", "rover", "fast"):
         for threads in (1, 2):
             contestants[f"{pipeline}, match and refine, {threads} threads"] = (
@@ -161,14 +106,11 @@ def speed() -> None:
     print(f"{'1280x960, 192 disparities, median of ' + str(ROUNDS):48} {'ms':>8}")
     for name, value in seconds.items():
         print(f"{name:48} {1e3 * value:8.1f}")
-    opencv, their_slic, our_slic, their_planes, our_planes, *_ = seconds.values()
-    print(f"SLIC over scikit-image's                        {our_slic / their_slic:8.3f}")
-    print(f"planes over scikit-image's, extrapolated        {our_planes / (their_planes * count / SAMPLE):8.4f}")
+    opencv = seconds["OpenCV MODE_HH, gray"]
     support = seconds["rover, match and refine, 1 threads"] - seconds["rover without support, 1 threads"]
     print(f"support over MODE_HH, on one core               {support / opencv:8.3f}")
     for pipeline in ("accurate", "rover", "fast"):
         whole = seconds[f"{pipeline}, match and refine, 2 threads"]
-        print(f"{pipeline} over MODE_HH and scikit-image's SLIC alone {whole / (opencv + their_slic):8.3f}")
         print(f"{pipeline} over MODE_HH alone                         {whole / opencv:8.3f}")
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.ndimage import distance_transform_edt
+from scipy import ndimage
 
 from stages.data import Array, Cell
 from stages.terrain.binarise import Binarise
-from stages.terrain.features import TerrainFeatures
+from stages.terrain.features import TerrainFeatures, _as_whole_obstacles
 from stages.terrain.kernels.cell_steps import cell_steps, cell_steps_reference
 from stages.terrain.kernels.local_minimum import local_minimum, local_minimum_reference
 from stages.terrain.kernels.nearest_known import nearest_known, nearest_known_reference
@@ -75,7 +75,7 @@ def test_nearest_known_cells_equal_those_of_scipy(seed: int, shape: tuple[int, i
     known = np.random.default_rng(seed).random(shape) < share
     known.flat[seed % known.size] = True
     cells = np.nonzero(~known)
-    distances, nearest = distance_transform_edt(~known, return_indices=True)
+    distances, nearest = ndimage.distance_transform_edt(~known, return_indices=True)
     distances, near = distances[cells], distances[cells] <= reach
     row, col, distance = nearest_known(known, *cells, reach)
     for got, want in zip((row, col, distance), nearest_known_reference(known, *cells, reach), strict=True):
@@ -83,6 +83,14 @@ def test_nearest_known_cells_equal_those_of_scipy(seed: int, shape: tuple[int, i
     assert (distance[near] == distances[near]).all()
     assert (distance[~near] > reach).all()
     assert (np.stack([row, col])[:, near] == nearest[:, *cells][:, near]).all()
+
+
+def test_all_cells_of_an_obstacle_have_its_largest_step() -> None:
+    chance = np.random.default_rng(4)
+    step, raised = chance.random((40, 57)), chance.random((40, 57)) < 0.3
+    label, count = ndimage.label(raised, np.ones((3, 3)))
+    highest = np.array([0.0, *ndimage.maximum(step, label, range(1, count + 1))])
+    assert np.array_equal(_as_whole_obstacles(step, raised), np.where(raised, highest[label], step))
 
 
 def test_empty_cells_around_the_ground_do_not_change_the_features() -> None:
