@@ -1,5 +1,3 @@
-from .sinks.mcap_sink import McapSink
-from .sinks.rerun_sink import RerunSink
-from .source.mcap_source import McapSource
-
-__all__ = ["McapSink", "McapSource", "RerunSink"]
+from .sinks.mcap_sink import McapSink as McapSink
+from .sinks.rerun_sink import RerunSink as RerunSink
+from .source.mcap_source import McapSource as McapSource

@@ -1,98 +1,48 @@
-from .cloud.clean import Clean
-from .cloud.level import Level
-from .cloud.reproject import Reproject
-from .cloud.voxel_grid import VoxelGrid
-from .data import (
-    CameraImage,
-    CameraModel,
-    CameraMotion,
-    Cell,
-    CellReason,
-    Disparity,
-    ElevationMap,
-    ImageNoise,
-    MatchFailure,
-    MatchHealth,
-    Mount,
-    NavigationMap,
-    PixelOrigin,
-    PointCloud,
-    Pose,
-    Region,
-    Rover,
-    StereoCamera,
-    StereoFrame,
-    Tilt,
-    TiltHealth,
-    Transform,
-    VoxelMap,
-    known,
-)
-from .localisation.pose_filter import PoseFilter
-from .localisation.tilt.check import CheckTilt
-from .localisation.visual_odometry import VisualOdometry
-from .matching.image_noise import MeasureNoise
-from .matching.lr_check import LeftRightCheck
-from .matching.match import Match
-from .matching.match_health import CheckMatches
-from .matching.match_opencv import MatchOpenCV
-from .matching.pyramid import Halve, SwapViews, Upsample
-from .rectification.rectify import Rectify
-from .refinement.paper import RefinePaper
-from .refinement.refine import Refine
-from .terrain.binarise import Binarise
-from .terrain.dem import Voxelise
-from .terrain.features import TerrainFeatures
-from .terrain.fuse import Fuse, FuseRegion
-from .terrain.map_region import MapRegion
-
-__all__ = [
-    "Binarise",
-    "CameraImage",
-    "CameraModel",
-    "CameraMotion",
-    "Cell",
-    "CellReason",
-    "CheckMatches",
-    "CheckTilt",
-    "Clean",
-    "Disparity",
-    "ElevationMap",
-    "Fuse",
-    "FuseRegion",
-    "Halve",
-    "ImageNoise",
-    "LeftRightCheck",
-    "Level",
-    "MapRegion",
-    "Match",
-    "MatchFailure",
-    "MatchHealth",
-    "MatchOpenCV",
-    "MeasureNoise",
-    "Mount",
-    "NavigationMap",
-    "PixelOrigin",
-    "PointCloud",
-    "Pose",
-    "PoseFilter",
-    "Rectify",
-    "Refine",
-    "RefinePaper",
-    "Region",
-    "Reproject",
-    "Rover",
-    "StereoCamera",
-    "StereoFrame",
-    "SwapViews",
-    "TerrainFeatures",
-    "Tilt",
-    "TiltHealth",
-    "Transform",
-    "Upsample",
-    "VisualOdometry",
-    "VoxelGrid",
-    "VoxelMap",
-    "Voxelise",
-    "known",
-]
+from .cloud.clean import Clean as Clean
+from .cloud.level import Level as Level
+from .cloud.reproject import Reproject as Reproject
+from .cloud.voxel_grid import VoxelGrid as VoxelGrid
+from .data import CameraImage as CameraImage
+from .data import CameraModel as CameraModel
+from .data import CameraMotion as CameraMotion
+from .data import Cell as Cell
+from .data import CellReason as CellReason
+from .data import Disparity as Disparity
+from .data import ElevationMap as ElevationMap
+from .data import ImageNoise as ImageNoise
+from .data import MatchFailure as MatchFailure
+from .data import MatchHealth as MatchHealth
+from .data import Mount as Mount
+from .data import NavigationMap as NavigationMap
+from .data import PixelOrigin as PixelOrigin
+from .data import PointCloud as PointCloud
+from .data import Pose as Pose
+from .data import Region as Region
+from .data import Rover as Rover
+from .data import StereoCamera as StereoCamera
+from .data import StereoFrame as StereoFrame
+from .data import Tilt as Tilt
+from .data import TiltHealth as TiltHealth
+from .data import Transform as Transform
+from .data import VoxelMap as VoxelMap
+from .data import known as known
+from .localisation.pose_filter import PoseFilter as PoseFilter
+from .localisation.tilt.check import CheckTilt as CheckTilt
+from .localisation.visual_odometry import VisualOdometry as VisualOdometry
+from .matching.image_noise import MeasureNoise as MeasureNoise
+from .matching.lr_check import LeftRightCheck as LeftRightCheck
+from .matching.match import Match as Match
+from .matching.match_health import CheckMatches as CheckMatches
+from .matching.match_opencv import MatchOpenCV as MatchOpenCV
+from .matching.pyramid import Halve as Halve
+from .matching.pyramid import SwapViews as SwapViews
+from .matching.pyramid import Upsample as Upsample
+from .rectification.rectify import Rectify as Rectify
+from .refinement.paper import RefinePaper as RefinePaper
+from .refinement.refine import Refine as Refine
+from .terrain.binarise import Binarise as Binarise
+from .terrain.dem import Voxelise as Voxelise
+from .terrain.features import TerrainFeatures as TerrainFeatures
+from .terrain.fuse import Fuse as Fuse
+from .terrain.fuse import FuseRegion as FuseRegion
+from .terrain.map_region import MapRegion as MapRegion

@@ -14,7 +14,7 @@ from stages import CameraModel, Disparity, StereoCamera, StereoFrame
 from stages.stage import Stage
 from tests.stages.running import Running
 
-NAMED = {name: getattr(stages, name) for name in stages.__all__}
+NAMED = {name: getattr(stages, name) for name in dir(stages)}
 KINDS = {name: kind for name, kind in NAMED.items() if isinstance(kind, type) and issubclass(kind, Stage)}
 
 
