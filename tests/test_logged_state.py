@@ -49,7 +49,7 @@ def common(terrain, other):
 def tried(log, pipeline, folder):
     """The last frame of the log, run with the state of a result log, or of no other frame; and the number before it."""
     changes = () if isinstance(pipeline, Path) else EVERY_MAP[3::2]
-    paths, _, part, _ = run_variants([log], pipeline, {"A": changes}, (AT, 1, 0), folder, 2)
+    paths, _, part, _ = run_variants([log], pipeline, {"A": changes}, folder, at=AT, frames=1, before=0, workers=2)
     return last_frame(paths["A"]), part.before
 
 

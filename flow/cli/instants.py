@@ -49,16 +49,28 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     times = log.file.times(log.channels("left")) if "left" in log.topics else np.zeros(0, np.int64)
     if not times.size:
         raise UsageError(f"{log.path} has no left images")
+    chosen = chosen_frame(log, times, at)
+    earlier = chosen - _nearest(log, times, before) if isinstance(before, np.datetime64) else before
+    low, end = max(0, chosen - earlier), min(times.size, chosen + frames)
+    edges, second = edges_of(log, times), (int(times[chosen]) - log.begin) / 1e9
+    numbers, stamp = (end - chosen, chosen - low), _stamp(log, times, chosen)
+    return Part(edges[low], edges[end], second, *numbers, stamp, edges[chosen])
+
+
+def chosen_frame(log: McapLog, times: NDArray[np.int64], at: Instant) -> int:
+    """The place of the left image at an instant; raises UsageError for one outside the images. times: log times, ns."""
     chosen = _nearest(log, times, at)
-    time, stamp = int(times[chosen]), _stamp(log, times, chosen)
-    off = _ns(log, at) - (time if isinstance(at, float | int) else stamp)
+    found = int(times[chosen]) if isinstance(at, float | int) else _stamp(log, times, chosen)
+    off = _ns(log, at) - found
     if (chosen == 0 and off < -ROUNDING) or (chosen == times.size - 1 and off > ROUNDING):
         raise UsageError(_outside(log, times, at))
-    earlier = chosen - _nearest(log, times, before) if isinstance(before, np.datetime64) else before
-    low, high = max(0, chosen - earlier), min(times.size, chosen + frames) - 1
+    return chosen
+
+
+def edges_of(log: McapLog, times: NDArray[np.int64]) -> list[float]:
+    """Where the part of a log begins that contains each left image, and where the last part ends, s."""
     edges = np.concatenate([times[:1] - MARGIN, (times[1:] + times[:-1]) // 2, times[-1:] + MARGIN])
-    start, first, end = (max(0, int(edges[place]) - log.begin) / 1e9 for place in (low, chosen, high + 1))
-    return Part(start, end, (time - log.begin) / 1e9, high - chosen + 1, chosen - low, stamp, first)
+    return [max(0, edge - log.begin) / 1e9 for edge in edges.tolist()]
 
 
 def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:

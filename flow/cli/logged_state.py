@@ -87,18 +87,18 @@ def _needs_none(node: Node) -> bool:
 
 
 def resume(
-    result: Path, opened: tuple[McapLog, Sequence[Path]], graphs: Mapping[str, Graph], variants: Variants, before: int
+    result: Path, graphs: Mapping[str, Graph], variants: Variants, *, log: McapLog, files: Sequence[Path], before: int
 ) -> tuple[np.datetime64 | int, dict[str, Any], list[str]]:
     """The first frame to run, the states that stages of the joined graph have there, and what a terminal prints.
 
-    result: a log of the run of the first graph; opened: its input, and the files of it; before: stamp of the instant,
-    ns. Raises UsageError for another input or a run of selected frames, LogError for messages of another profile.
+    result: a log of the run of the first graph; log, files: its input; before: stamp of the instant, ns. Raises
+    UsageError for another input or a run of selected frames, LogError for messages of another profile.
     """
     about = about_run(result)
     check_profile(result, about)
     if about.get("every"):
         raise UsageError(f"{result} has only the frames of --every {about['every']}; give the result of a whole run")
-    check_input(*opened, result)
+    check_input(log, files, result)
     logged = logged_state(result, graphs["A"], before)
     if logged is None:
         return 0, {}, [f"{result} has no regional map or visual odometry before the instant, so no stage has a state"]

@@ -56,14 +56,14 @@ def swept_setting(changes: Mapping[str, Sequence[str]]) -> tuple[str, list[str]]
 
 
 def run_variants(
-    logs: Sequence[Path], pipeline: str | Path, changes: Mapping[str, Sequence[str]], place: tuple[Instant, int, int],
-    folder: Path, workers: int,
+    logs: Sequence[Path], pipeline: str | Path, changes: Mapping[str, Sequence[str]], folder: Path,
+    *, at: Instant, frames: int, before: int, workers: int,
 ) -> tuple[dict[str, Path], Variants, Part, list[str]]:  # fmt: skip
     """Run all variants over a part of a log. Returns their result logs in `folder`, the merged graphs, the part that
     these logs cover, and notes for a terminal.
 
-    pipeline: its name; or a result log of it, which then has the state before the instant; place: instant, frames from
-    there on, and frames before it, as for `part_of`. These logs have only the frames from the instant on.
+    pipeline: its name; or a result log of it, which then has the state before the instant; at, frames, before: as for
+    `part_of`. The result logs have only the frames from the instant on.
 
     Raises
     ------
@@ -80,28 +80,30 @@ def run_variants(
     with beside, graphs["A"].source.open(logs) as log, one_thread_per_call():
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}
         variants, states, notes = merged(graphs), dict[str, Any](), list[str]()
-        part = part_of(log, *place)
+        part = part_of(log, at, frames, before)
         if isinstance(pipeline, Path):
-            first, states, notes = resume(pipeline, (log, logs), graphs, variants, part.stamp)
-            part = part_of(log, *place[:2], first)
-        if part.frames < place[1]:
-            notes.append(f"note: the log has only {counted(part.frames, 'frame')} from there on, not {place[1]}")
+            first, states, notes = resume(pipeline, graphs, variants, log=log, files=logs, before=part.stamp)
+            part = part_of(log, at, frames, first)
+        if part.frames < frames:
+            notes.append(f"note: the log has only {counted(part.frames, 'frame')} from there on, not {frames}")
         log.narrow(part.start, part.end)
         about = {
             "roverflow": product_version(), "log": ", ".join(path.name for path in dict.fromkeys(logs)),
             "start": repr(part.first), "end": repr(part.end), "every": "",
         }  # fmt: skip
-        sinks = tuple((label, _sink(graphs[label], variants, label, (changes[label], part.stamp))) for label in graphs)
+        sinks = tuple(
+            (label, _sink(graphs[label], variants, label, changes[label], first=part.stamp)) for label in graphs
+        )
         paths = {label: folder / f"{label}.mcap" for label in graphs}
         ran = replace(variants.graph, sinks=sinks)
         summary = run(ran, log, paths, workers=workers, about=about, states=states)
-    frames = stamps_of(paths["A"], results=True).size if all(path.exists() for path in paths.values()) else 0
-    if not frames:
+    through = stamps_of(paths["A"], results=True).size if all(path.exists() for path in paths.values()) else 0
+    if not through:
         raise no_frame(part, summary)
-    if frames < part.frames:
+    if through < part.frames:
         says_why = f"roverflow run --start {part.first:.3f} --end {part.end:.3f} says why"
-        notes.append(f"note: {counted(part.frames - frames, 'frame')} gave no result; {says_why}")
-    return paths, variants, replace(part, frames=frames), notes
+        notes.append(f"note: {counted(part.frames - through, 'frame')} gave no result; {says_why}")
+    return paths, variants, replace(part, frames=through), notes
 
 
 def summary_lines(variants: Variants, part: Part) -> list[str]:
@@ -117,9 +119,8 @@ def summary_lines(variants: Variants, part: Part) -> list[str]:
     ]
 
 
-def _sink(graph: Graph, variants: Variants, label: str, part: tuple[Sequence[str], int]) -> Any:
-    """The result log of a variant. part: its changes, and the stamp, ns, of its first frame."""
-    changes, first = part
+def _sink(graph: Graph, variants: Variants, label: str, changes: Sequence[str], *, first: int) -> Any:
+    """The result log of a variant. first: the stamp, ns, of its first frame."""
     own = {merged_name: name for name, merged_name in variants.names[label].items()}
     about = {"pipeline": graph.text, "overrides": "\n".join(changes)}
     return VariantSink(sink_of(graph, ".mcap"), own, about, first)

@@ -52,10 +52,10 @@ def run(options: argparse.Namespace) -> int:
 
     changes, pipeline = changes_of(options.set), result or options.pipeline or "rover"
     unchanged = f"A: {pipeline} as it is" if result is None else f"A: the run of {result}"
-    place = (without_cursor(options.at), options.frames, options.before)
+    at, frames, before = without_cursor(options.at), options.frames, options.before
     with TemporaryDirectory(prefix="roverflow-try-") as folder:
         paths, variants, part, notes = run_variants(
-            options.log, pipeline, changes, place, Path(folder), options.workers
+            options.log, pipeline, changes, Path(folder), at=at, frames=frames, before=before, workers=options.workers
         )
         say("\n".join([*summary_lines(variants, part), *notes]))
         from recordings.comparison.diff import diff  # imported beside the run, as rerun takes long
