@@ -19,6 +19,7 @@ from recordings.containers.finding import find_files
 
 if TYPE_CHECKING:
     from recordings.comparison.diff import Diff
+    from recordings.comparison.recording import DiffRecording
     from recordings.comparison.sweep import Sweep
 
 HELP = "run one instant of a log with and without a change of the pipeline, and compare"
@@ -57,36 +58,48 @@ def run(options: argparse.Namespace) -> int:
         paths, variants, part, notes = run_variants(
             options.log, pipeline, changes, Path(folder), at=at, frames=frames, before=before, workers=options.workers
         )
-        say("\n".join([*summary_lines(variants, part), *notes]))
-        from recordings.comparison.diff import diff  # imported beside the run, as rerun takes long
-        from recordings.comparison.recording import DiffRecording
-        from recordings.comparison.text import comparison, markdown
-
-        say(f"\n{unchanged}")
-        recording, tables, differences = DiffRecording(), ["\n\n".join([unchanged, *notes])], dict[str, "Diff"]()
-        for label, path in paths.items():
-            if label != "A":
-                differences[label] = found = diff(
-                    paths["A"], path, recording.of(label, f"{label}: {changes[label][-1]}")
-                )
-                say(f"\n{label}: {', '.join(changes[label])}\n{comparison(found)}")
-                tables += [f"## {label}: {', '.join(changes[label])}", markdown(found)]
+        say("\n".join([*summary_lines(variants, part), *notes, "", unchanged]))
+        recording, differences, tables = compared(paths, changes)
         if all(found.equal for found in differences.values()):
             say(f"\nthe change has no effect on {counted(part.frames, 'frame')}, so there is no recording to write")
             return COMPLETE
         title, setting = f"{options.log[0].name} at {part.at:g} s", swept_setting(changes)
-        recording.write(out, title, "\n\n".join(tables), _sweep(setting, [], differences))
+        tables = ["\n\n".join([unchanged, *notes]), *tables]
+
+        def write(errors: list[list[str]]) -> None:
+            rows = ["## Errors", *_markdown_rows(errors)] if errors else []
+            recording.write(out, title, "\n\n".join([*rows, *tables]), _sweep(setting, errors, differences))
+
+        write([])
         say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
-        errors = _errors(paths, options.log[0])
-        if errors:
+        if errors := _errors(paths, options.log[0]):
             say("\n" + "\n".join("  ".join(f"{cell:>12}" for cell in row) for row in errors))
             from recordings.comparison.truth import error_pages
 
             recording.errors = [*error_pages(paths, options.log[0])]
-            tables = ["## Errors", *_markdown_rows(errors), *tables]
-            recording.write(out, title, "\n\n".join(tables), _sweep(setting, errors, differences))
+            write(errors)
             say(f"\nadded the errors to {out}")
     return COMPLETE
+
+
+def compared(
+    paths: Mapping[str, Path], changes: Mapping[str, Sequence[str]]
+) -> tuple[DiffRecording, dict[str, Diff], list[str]]:
+    """Compare the variants with A, and print how they differ. Returns the recording, variant -> difference, and tables.
+
+    paths: variant -> its result log; changes: variant -> its changes.
+    """
+    from recordings.comparison.diff import diff
+    from recordings.comparison.recording import DiffRecording
+    from recordings.comparison.text import comparison, markdown
+
+    recording, differences, tables = DiffRecording(), dict[str, "Diff"](), list[str]()
+    for label, path in list(paths.items())[1:]:
+        title = f"{label}: {', '.join(changes[label])}"
+        differences[label] = found = diff(paths["A"], path, recording.of(label, f"{label}: {changes[label][-1]}"))
+        say(f"\n{title}\n{comparison(found)}")
+        tables += [f"## {title}", markdown(found)]
+    return recording, differences, tables
 
 
 def _errors(paths: dict[str, Path], truth: Path) -> list[list[str]]:
