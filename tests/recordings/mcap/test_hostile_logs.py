@@ -152,18 +152,6 @@ def schema_of(text: str) -> Extra:
     return extra
 
 
-def overlapping(count: int, megabytes: int) -> Callable[[Path], Path]:
-    """Chunks that begin and end together."""
-
-    def extra(writer: Writer, channels: dict[str, int]) -> None:
-        for number in range(count):
-            writer.add_message(channels[TILT], START, NOTHING, START)
-            writer.add_message(channels[LEFT], START + number, bytes(megabytes << 20), START)
-            writer.add_message(channels[TILT], START + 1_000_000_000, NOTHING, START)
-
-    return with_extra(extra, chunk_size=megabytes << 20)
-
-
 SMALL = {
     "png of 6000x6000": lambda: images(png(6000), 6000),
     "jpeg of 30000x30000": lambda: images(jpeg(30000), 30000),
@@ -184,7 +172,6 @@ LARGE = {
     "20000 topics": lambda: with_extra(lambda *to: many_topics(*to, 20_000)),
     "channels of 200 MB": lambda: with_extra(lambda *to: large_channels(*to, 2000)),
     "chunk of 2 GB": lambda: with_extra(messages_of(bytes(2000 << 20), 1), chunk_size=1 << 31),
-    "chunks of 60 MB that overlap": lambda: overlapping(40, 60),
     "6 million messages": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000)),
     "6 million messages in a database": lambda: database(
         6_000_000, f"x'{NOTHING.hex()}'", "/tiny", "std_msgs/msg/Float64"

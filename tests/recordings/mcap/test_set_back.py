@@ -13,7 +13,8 @@ from tests.conftest import Row, mcap_rows, rewrite
 from tests.recordings.sample_log import FRAMES, LAYOUTS, LEFT, PERIOD, START, essences, inventory_of, items_of, sound
 
 BACK = 23 * PERIOD // 10
-EVERY_LAYOUT = pytest.mark.parametrize("options", [{}, *LAYOUTS.values()], ids=["one chunk", *LAYOUTS])
+_NAMES = "small chunks", "no index", "no chunks"  # where messages are found by an index, in a walk, or outside chunks
+EVERY_LAYOUT = pytest.mark.parametrize("options", [LAYOUTS[name] for name in _NAMES], ids=_NAMES)
 FIRST = 3  # the first frame after the clock was set back
 
 

@@ -16,7 +16,6 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import camera_info, header, image, imu, odometry, transform_message
 from stages.data import CameraImage, Mount, Pose, Transform
-from tests.recordings.containers.forms import rows_of, write_bag
 from tests.recordings.sample_log import START, TRANSFORMS, model, picture
 
 MS = 1_000_000
@@ -232,11 +231,3 @@ def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
         assert log.refused["joints"].endswith("no angles of; it has those of wheel, pan")
     with McapSource(joints=str(file)).open(written(tmp_path / "none.mcap", lambda stamp: None)) as log:
         assert log.refused["joints"].endswith("it has no sensor_msgs/JointState")
-
-
-def test_a_ros_1_bag_has_the_same_mounts(tmp_path):
-    path = written(tmp_path / "log.mcap")
-    mounts, lost, _ = read(write_bag(rows_of(path), tmp_path / "log.bag"))
-    assert lost == []
-    rotations = [[mount.camera_from_inclinometer for mount in found] for found in (mounts, read(path)[0])]
-    np.testing.assert_array_equal(*rotations)

@@ -21,7 +21,6 @@ from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite, slow
-from tests.recordings.containers.forms import rows_of, write_bag
 from tests.recordings.inertial.drive import Drive, drive
 from tests.recordings.sample_log import TRANSFORMS, model, picture
 
@@ -289,10 +288,3 @@ def test_poses_in_an_upright_frame_are_tilts_where_a_setting_says_so(tmp_path):
         assert sum(isinstance(item, Pose) for _, _, item in log.events()) == len(driven.stamps)
     _, lost, _ = read(path, McapSource(upright_frame="map"))
     assert "its frame is 'odom', but 'upright_frame' of the source is 'map'" in lost[0]
-
-
-def test_a_ros_1_bag_has_the_same_estimates(tmp_path):
-    path = written(tmp_path / "log.mcap", drive(seconds=6))
-    tilts, lost, _ = read(write_bag(rows_of(path), tmp_path / "log.bag"))
-    assert lost == []
-    np.testing.assert_array_equal([tilt.up for tilt in tilts], [tilt.up for tilt in read(path)[0]])
