@@ -10,6 +10,7 @@ A waiting message gives up when the stream of its partner has moved past it, or 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -49,7 +50,7 @@ def _duration(default: int | None, help: str) -> Any:
     return parameter(default, help, unit="ns", low=0)
 
 
-def _time(nanoseconds: int) -> str:
+def _time(nanoseconds: float) -> str:
     """A time in words: "20 ms", "1.5 s"."""
     value, unit = (nanoseconds / 1e6, "ms") if nanoseconds < 1_000_000_000 else (nanoseconds / 1e9, "s")
     return f"{round(value, 3):.15g} {unit}"
@@ -127,23 +128,18 @@ class PairState:
             while queue:
                 yield self._unmatched(port, "the log ended before its partner came")
 
-    def _unmatched(self, port: str, why: str = "") -> Loss:
-        """Give up the message of `port` that waits longest.
-
-        why: the reason where its partner has not been given up before; without one, the distance to the nearest message
-        of the other port is the reason.
-        """
+    def _unmatched(self, port: str, waited: str = "") -> Loss:
+        """Give up the message of `port` that waits longest. waited: for how long, in words, if it waited to a limit."""
         other = "left" if port == "right" else "right"
         arrived, token = self.waiting[port].popleft()
-        candidates = [*self.given_up[other]]
-        if self.waiting[other]:
-            logged, first = self.waiting[other][0]
-            candidates.append((first.stamp, logged))
-        apart, logged = min(((abs(stamp - token.stamp), at) for stamp, at in candidates), default=(None, 0))
-        if apart is not None and apart <= self.config.slop:
+        known = [*self.given_up[other], *((first.stamp, logged) for logged, first in [*self.waiting[other]][:1])]
+        apart, logged = min(((abs(stamp - token.stamp), at) for stamp, at in known), default=(math.inf, 0))
+        if apart <= self.config.slop:
             late = f"it was logged {_time(arrived - logged)} after its {self.inputs[other]}"
             why = f"{late}, more than {_time(self.config.patience)} ({self.name}.patience)"
-        elif apart is not None and not why:
+        elif waited:
+            why = waited
+        else:
             limit = f"{_time(self.config.slop)} ({self.name}.slop)"
             why = f"the nearest {self.inputs[other]} without a partner is {_time(apart)} away, more than {limit}"
         self.given_up[port].append((token.stamp, arrived))
