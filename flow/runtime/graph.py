@@ -265,8 +265,15 @@ def misfit(value: Any, kind: Any) -> str:
     for name, item, wanted in _contents(value, parts):
         if why := misfit(item, wanted):
             return f"{why}, as {name!r}"
-    for wanted in (scalar for part in parts[1:] for scalar in get_args(part) if hasattr(value, "dtype")):
-        given = value.dtype.type
+    return array_misfit(value.dtype.type, parts) if hasattr(value, "dtype") else ""
+
+
+def array_misfit(given: type, parts: tuple[Any, ...]) -> str:
+    """Why an array with numbers of type `given` is not annotated so; empty where it is.
+
+    parts: the arguments of its annotated type, such as those of `ndarray[Any, dtype[float64]]`.
+    """
+    for wanted in (scalar for part in parts[1:] for scalar in get_args(part)):
         if isinstance(wanted, type) and not issubclass(given, (wanted, wanted.__mro__[1])):
             return f"an array of {given.__name__}, not of {wanted.__name__}"
     return ""
