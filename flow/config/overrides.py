@@ -44,17 +44,19 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
     changes of streams are left.
     """
     given = mapping(tree.value.get("settings", Value({}, tree.place)), "'settings'")
-    settings, left, streams = dict(given), [], _part(tree, "streams", dict)
+    settings, of_parts, of_streams, streams = dict(given), list[Change](), list[Change](), _part(tree, "streams", dict)
     sinks = {_class_name(item): number for number, item in enumerate(_part(tree, "sinks", list))}
-    entries = {*streams, *({"source"} & tree.value.keys()), *sinks}
+    parts = {"source"} & tree.value.keys() | sinks.keys() - streams.keys()
     for change in changes:
-        if change.keys and (change.target in entries or "/" in change.target):
-            left.append(change)
+        if change.keys and change.target in parts:
+            of_parts.append(change)
+        elif change.keys and (change.target in streams or "/" in change.target):
+            of_streams.append(change)
         elif change.target in settings:
             settings[change.target] = _with_value(settings[change.target], change.target, change.keys, change.value)
         else:
-            raise change.value.place.error(_unknown(change, entries, settings))
-    parts = {
+            raise change.value.place.error(_unknown(change, {*streams, *parts}, settings))
+    filled = {
         key: item if key in ("templates", "settings") else filled_in(item, settings) for key, item in tree.value.items()
     }
     used = {leaf.value for key, item in tree.value.items() if key != "templates" for leaf in item.leaves()}
@@ -63,18 +65,18 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
             raise settings[name].place.error(f"the setting '{name}' refers to another setting; give it a value")
         if f"${name}" not in used:
             raise item.place.error(f"the setting '{name}' is used nowhere; write ${name} where it belongs")
-    of_streams = []
-    for change in left:
-        filled = replace(change, value=filled_in(change.value, settings))
+    for change in (_filled(change, settings) for change in of_parts):
         if change.target == "source":
-            parts["source"] = filled.applied(parts["source"])
-        elif change.target in sinks and change.target not in streams:
-            listed = list(parts["sinks"].value)
-            listed[sinks[change.target]] = filled.applied(listed[sinks[change.target]])
-            parts["sinks"] = Value(listed, parts["sinks"].place)
+            filled["source"] = change.applied(filled["source"])
         else:
-            of_streams.append(filled)
-    return Value(parts, tree.place), of_streams
+            number, listed = sinks[change.target], list(filled["sinks"].value)
+            listed[number] = change.applied(listed[number])
+            filled["sinks"] = Value(listed, filled["sinks"].place)
+    return Value(filled, tree.place), [_filled(change, settings) for change in of_streams]
+
+
+def _filled(change: Change, settings: Mapping[str, Value]) -> Change:
+    return replace(change, value=filled_in(change.value, settings))
 
 
 def filled_in(item: Value, values: Mapping[str, Value]) -> Value:

@@ -6,7 +6,7 @@ are called `use/stream`. A template is found in the pipeline file or among the p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -161,9 +161,12 @@ class Expansion:
     def _add(self, name: str, path: str, item: Value, scope: Scope | None = None, within: tuple[str, ...] = ()) -> None:
         """Add the stream `name`, or the streams of the template that it uses; within: the templates around it."""
         self._paths.append(path)
+        changes = [change for change in self._left if change.target == path]
+        self._left = [change for change in self._left if change.target != path]
         is_use = _is_use(item)
-        for change in self._taken(path, lambda change: not is_use or change.keys[0] == "template"):
-            item = change.applied(item)
+        for change in changes:
+            if not is_use or change.keys[0] == "template":
+                item = change.applied(item)
         if not _is_use(item):
             self.streams[name] = StreamSpec(item, scope)
             return
@@ -171,19 +174,13 @@ class Expansion:
         if template.name in within:
             circle = " -> ".join([*within[within.index(template.name) :], template.name])
             raise item.value["template"].place.error(f"template '{template.name}' uses itself: {circle}")
-        own = (*template.inputs, *template.parameters, "optional")
-        for change in self._taken(path, lambda change: change.keys[0] in own):
-            item = change.applied(item)
-        for change in self._taken(path, lambda change: True):  # of the output stream
-            _check_key(change, template)
-            self._left.append(replace(change, target=f"{path}/{template.output}"))
+        for change in changes:
+            if change.keys[0] in (*template.inputs, *template.parameters, "optional"):
+                item = change.applied(item)
+            elif change.keys[0] != "template":  # of the output stream
+                _check_key(change, template)
+                self._left.append(replace(change, target=f"{path}/{template.output}"))
         self._expand(name, path, item, template, scope, (*within, template.name))
-
-    def _taken(self, path: str, wanted: Callable[[Change], bool]) -> list[Change]:
-        """Take the changes of one entry from those that are left."""
-        taken = [change for change in self._left if change.target == path and wanted(change)]
-        self._left = [change for change in self._left if change not in taken]
-        return taken
 
     def _expand(
         self, name: str, path: str, use: Value, template: Template, scope: Scope | None, within: tuple[str, ...]
