@@ -49,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     if result is not None and options.pipeline:
         raise UsageError(f"the pipeline is that of {result}; leave out -p")
     check_outputs({"difference": out}, [*options.log, *filter(None, [result])])
-    from flow.cli.what_if import changes_of, run_variants, summary_lines, swept_setting
+    from flow.cli.debugging.what_if import changes_of, run_variants, summary_lines, swept_setting
 
     changes, pipeline = changes_of(options.set), result or options.pipeline or "rover"
     unchanged = f"A: {pipeline} as it is" if result is None else f"A: the run of {result}"

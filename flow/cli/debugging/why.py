@@ -16,8 +16,8 @@ from flow.contracts import counted
 from flow.errors import COMPLETE, UsageError
 
 if TYPE_CHECKING:
-    from flow.cli.explanation import Explanation
-    from flow.cli.regional_explanation import RegionalExplanation
+    from flow.cli.debugging.explanation import Explanation
+    from flow.cli.debugging.regional_explanation import RegionalExplanation
     from stages.terrain.verdict_limits import Limit, Turn
 
 HELP = "explain a cell of a navigation map: its pixels, its limits, and what would turn its verdict"
@@ -42,8 +42,8 @@ def run(options: argparse.Namespace) -> int:
     """Print the explanation and draw the pixels."""
     out = options.out or options.result.with_name(f"{options.result.stem}-why.png")
     check_outputs({"picture": out}, [options.result])
-    from flow.cli.explanation import why
-    from flow.cli.result_input import note_damage
+    from flow.cli.debugging.explanation import why
+    from flow.cli.debugging.result_input import note_damage
     from recordings.comparison.marked_pixels import write_marked
 
     options.at = without_cursor(options.at)
@@ -71,7 +71,7 @@ def _is_regional(result: Path, stream: str) -> bool:
 
 def _regional(options: argparse.Namespace) -> int:
     """Print the explanation of a cell of a regional map."""
-    from flow.cli.regional_explanation import why_regional
+    from flow.cli.debugging.regional_explanation import why_regional
     from recordings.comparison.text import moment
 
     if options.cell is None or options.out is not None:

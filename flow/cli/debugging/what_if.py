@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flow.cli.instants import Instant, Part, no_frame, part_of
-from flow.cli.logged_state import resume
+from flow.cli.debugging.instants import Instant, Part, no_frame, part_of
+from flow.cli.debugging.logged_state import resume
+from flow.cli.debugging.result_input import graph_of
 from flow.cli.replay import ARROW_EXTRA, RESULT_TYPES, one_thread_per_call, product_version
-from flow.cli.result_input import graph_of
 from flow.config.loader import load
 from flow.contracts import counted
 from flow.errors import UsageError

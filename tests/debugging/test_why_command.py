@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flow.cli.explanation import why
-from flow.cli.instants import part_of
-from flow.cli.regional_explanation import why_regional
-from flow.cli.result_input import graph_of
+from flow.cli.debugging.explanation import why
+from flow.cli.debugging.instants import part_of
+from flow.cli.debugging.regional_explanation import why_regional
+from flow.cli.debugging.result_input import graph_of
 from recordings import McapSource
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flow.cli.regional_explanation import level_in
-from flow.cli.result_input import check_input
+from flow.cli.debugging.regional_explanation import level_in
+from flow.cli.debugging.result_input import check_input
 from flow.errors import UsageError
 from flow.runtime.graph import Graph, Node
 from flow.runtime.variants import Variants, sink_of

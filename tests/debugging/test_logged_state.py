@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flow.cli.logged_state import logged_state
-from flow.cli.result_input import graph_of
-from flow.cli.what_if import run_variants
+from flow.cli.debugging.logged_state import logged_state
+from flow.cli.debugging.result_input import graph_of
+from flow.cli.debugging.what_if import run_variants
 from flow.runtime.variants import merged
 from recordings.results import read_result
 from stages import FuseRegion

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from flow.cli.arguments import instant
+from flow.cli.debugging.instants import part_of
 from flow.cli.debugging.viewer_cursor import without_cursor
-from flow.cli.instants import part_of
 from flow.errors import UsageError
 from recordings import McapSource
 from tests.conftest import SMALL, roverflow

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from flow.cli.instants import Instant, no_frame, part_of
+from flow.cli.debugging.instants import Instant, no_frame, part_of
+from flow.cli.debugging.result_input import graph_of, input_of
 from flow.cli.replay import one_thread_per_call
-from flow.cli.result_input import graph_of, input_of
 from flow.contracts import FrameRecord
 from flow.errors import UsageError
 from flow.runtime.graph import Graph

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flow.cli.explanation import CellExplanation, centre_of, index_of, verdict_at
-from flow.cli.instants import Instant, ns_of
+from flow.cli.debugging.explanation import CellExplanation, centre_of, index_of, verdict_at
+from flow.cli.debugging.instants import Instant, ns_of
+from flow.cli.debugging.result_input import graph_of, input_of
 from flow.cli.report import say
-from flow.cli.result_input import graph_of, input_of
 from flow.errors import UsageError
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded

@@ -9,7 +9,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from flow.cli.instants import is_other
+from flow.cli.debugging.instants import is_other
 from flow.cli.report import say
 from flow.config.loader import load
 from flow.errors import RoverflowError, UsageError
