@@ -95,56 +95,66 @@ def log_stereo(canvas: Canvas, stream: str, frame: StereoFrame) -> None:
 
 @logger_for(Disparity)
 def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
-    """The disparities (hover reads them in px), the origin of each pixel, and the superpixels' edges.
-
-    Shares are those of the pixels that are drawn.
-    """
-    width = canvas.width(stream)
-    source = np.ascontiguousarray(colormaps.every_nth(disparity.source, width))
-    counts = label_counts(source)
+    """The disparities, what is known of them, and the superpixels; the caption has the shares of the drawn pixels."""
+    source = np.ascontiguousarray(colormaps.every_nth(disparity.source, canvas.width(stream)))
+    counts, final = label_counts(source), stream in canvas.full_size
+    if canvas.pictures:
+        _log_pixels(canvas, stream, disparity.pixels, source == PixelOrigin.FILLED if final else None)
+        _log_source(canvas, stream, source, counts)
+        if final:
+            _log_confidence(canvas, stream, disparity, Panel.CONFIDENCE, "confidence")
+            _log_sigma(canvas, stream, disparity)
+            _log_depth(canvas, stream, disparity)
+        elif stream in canvas.matched and disparity.segments is None:
+            _log_confidence(canvas, stream, disparity, Panel.MATCH_CONFIDENCE, "confidence of the match")
+        _log_costs(canvas, stream, disparity)
+        _log_superpixels(canvas, stream, disparity)
     shares = {kind: 100.0 * counts[kind] / source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
     share = 100.0 * counts[known(ALL_CODES)].sum() / source.size
-    caption = f"{stream} {', '.join([f'{share:.0f} % known', *parts])}"
-    if not canvas.pictures:
-        return caption
-    filled = source == PixelOrigin.FILLED if stream in canvas.full_size else None
-    _log_pixels(canvas, stream, disparity.pixels, width, filled)
+    return f"{stream} {', '.join([f'{share:.0f} % known', *parts])}"
+
+
+def _log_pixels(canvas: Canvas, stream: str, pixels: Array, filled: Array | None) -> None:
+    """The disparities of every n-th pixel, with their scale. filled: which of these are faint, as guesses are."""
+    thinned = colormaps.every_nth(pixels, canvas.width(stream))
+    _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(thinned))
+    view, steps = ViewSpec(Panel.DISPARITY, stream, "pixels", stream), colormaps.whole_steps(thinned, DISPARITY_STEPS)
+    canvas.log_steps(steps, DISPARITY_STEPS, limit, view, "px", veiled=("filled", filled))
+
+
+def _log_source(canvas: Canvas, stream: str, source: Array, counts: Array) -> None:
+    """The origin of every n-th pixel, unless all of them are measured or unknown. counts: of each code."""
     if not {*np.flatnonzero(counts).tolist()} <= {PixelOrigin.UNKNOWN, PixelOrigin.MEASURED}:
         view = ViewSpec(Panel.SOURCE, stream, "source", f"{stream}: source")
         canvas.log_labels(view, source, colormaps.SOURCE_LEGEND, beside=True, counts=counts)
-    if stream in canvas.full_size:
-        _log_confidence(canvas, ViewSpec(Panel.CONFIDENCE, stream, "confidence", f"{stream}: confidence"), disparity)
-        _log_sigma(canvas, stream, disparity)
-        _log_depth(canvas, stream, disparity)
-    if disparity.costs is not None and canvas.camera and disparity.pixels.shape[1] == canvas.camera.width:
-        _log_costs(canvas, stream, disparity.costs)
-    if stream in canvas.matched and disparity.segments is None:
-        title = f"{stream}: confidence of the match"
-        _log_confidence(canvas, ViewSpec(Panel.MATCH_CONFIDENCE, stream, "confidence", title), disparity)
-    if disparity.segments is not None:
-        # They lie over the left image. Edges of fewer pixels are denser, so they are fainter.
-        segments, step = disparity.segments, colormaps.stride(disparity.segments.shape[1], canvas.whole_width)
-        segments = np.ascontiguousarray(colormaps.every_nth(segments, canvas.whole_width))
-        lines = png(colormaps.segment_edges(segments))
+
+
+def _log_superpixels(canvas: Canvas, stream: str, disparity: Disparity) -> None:
+    """The edges of the superpixels, over the left image. Edges of fewer pixels are denser, so they are fainter."""
+    if (segments := disparity.segments) is not None:
+        thinned = np.ascontiguousarray(colormaps.every_nth(segments, canvas.whole_width))
+        lines, step = png(colormaps.segment_edges(thinned)), colormaps.stride(segments.shape[1], canvas.whole_width)
         style = {"media_type": "image/png", "opacity": 0.4 / step, "draw_order": 10.0}
         view = ViewSpec(Panel.SUPERPIXELS, stream, "superpixels", f"{stream}: superpixels")
         canvas.log_blob(view.path, rr.EncodedImage, lines, view, **style)
-    return caption
 
 
-def _log_confidence(canvas: Canvas, view: ViewSpec, disparity: Disparity) -> None:
+def _log_confidence(canvas: Canvas, stream: str, disparity: Disparity, panel: Panel, title: str) -> None:
     """The confidence of every n-th pixel, in percent; 0 is unknown, and as dark as the least."""
     pixels, confidence = (
         colormaps.every_nth(layer, canvas.small_width) for layer in (disparity.pixels, disparity.confidence)
     )
     percent = np.where(np.isnan(pixels), np.float32(0), 100 * confidence)
+    view = ViewSpec(panel, stream, "confidence", f"{stream}: {title}")
     canvas.log_values(np.rint(percent).astype(np.uint8), (20.0, 100.0), view, "%")
 
 
-def _log_costs(canvas: Canvas, stream: str, costs: Array) -> None:
-    """What the search found at every n-th pixel: its lowest cost, and by how much that beats the next lowest."""
-    lowest, next_lowest = (colormaps.every_nth(layer, canvas.small_width) for layer in costs)
+def _log_costs(canvas: Canvas, stream: str, disparity: Disparity) -> None:
+    """What a search at full size found at every n-th pixel: its lowest cost, and by how much that beats the next."""
+    if disparity.costs is None or not canvas.camera or disparity.pixels.shape[1] != canvas.camera.width:
+        return
+    lowest, next_lowest = (colormaps.every_nth(layer, canvas.small_width) for layer in disparity.costs)
     view = ViewSpec(Panel.COST, stream, "cost", f"{stream}: lowest cost")
     canvas.log_values(np.ascontiguousarray(lowest), (0.0, MAX_COST), view, "")
     view = ViewSpec(Panel.LEAD, stream, "lead", f"{stream}: lead over the next cost")
@@ -169,15 +179,6 @@ def _log_depth(canvas: Canvas, stream: str, disparity: Disparity) -> None:
         depth = camera.fx * camera.baseline / np.where(shifted > 0, shifted, np.float32(np.nan))
         view = ViewSpec(Panel.DEPTH, stream, "depth", f"{stream}: depth")
         canvas.log_steps(colormaps.whole_steps(depth, DEPTH_STEPS), DEPTH_STEPS, MAX_DEPTH, view, "m")
-
-
-def _log_pixels(canvas: Canvas, stream: str, pixels: Array, max_width: int, filled: Array | None) -> None:
-    """The disparities of every n-th pixel, with their scale. filled: which of these are faint, as guesses are."""
-    thinned = colormaps.every_nth(pixels, max_width)
-    _, limit = canvas.limits(stream, 0.0, colormaps.disparity_limit(thinned))
-    view = ViewSpec(Panel.DISPARITY, stream, "pixels", stream)
-    steps = colormaps.whole_steps(thinned, DISPARITY_STEPS)
-    canvas.log_steps(steps, DISPARITY_STEPS, limit, view, "px", veiled=("filled", filled))
 
 
 @logger_for(PointCloud)
