@@ -42,6 +42,13 @@ Logged = tuple[int, str, Any]
 
 
 @dataclass(frozen=True)
+class Deferred:
+    """A message that is made only if the unfinished log lacks it."""
+
+    make: Callable[[], Any]
+
+
+@dataclass(frozen=True)
 class ImagePair:
     """The files of a stereo frame."""
 
@@ -104,10 +111,10 @@ def write_recording(
         start = next(events)
         writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in mounts), start[0])
         for stamp, topic, message in chain([start], events):
-            if not isinstance(message, partial):
+            if not isinstance(message, Deferred):
                 writer.write(topic, message, stamp)
             elif not writer.skip(topic, stamp):
-                writer.write(topic, message(), stamp)
+                writer.write(topic, message.make(), stamp)
         if recording.metadata is not None:
             writer.metadata(*recording.metadata)
         if len(unreadable) == len(recording.pairs):
@@ -125,7 +132,7 @@ def _frames(
     unreadable: list[str],
     progress: Callable[[int], None],
 ) -> Iterator[Logged]:
-    """The messages of each frame, as a partial those of images that the unfinished log contains.
+    """The messages of each frame; those of images that the unfinished log contains are `Deferred`.
 
     The reasons why a pair is left out go into `unreadable`.
     """
@@ -151,13 +158,13 @@ def _frames(
 def _images(
     pair: ImagePair, cameras: Sequence[CameraModel], topics: Sequence[str], contained: Mapping[str, Collection[int]]
 ) -> list[Logged]:
-    """The messages of a pair; if an unfinished log contains both, partials that make them. Raises LogError."""
+    """The messages of a pair, `Deferred` if an unfinished log contains both. Raises LogError."""
     sides = zip((LEFT, RIGHT), (pair.left, pair.right), cameras, strict=True)
     makers = [partial(image_message, pair.stamp, *side) for side in sides]
     possible = [topic + ending for topic in topics for ending in ENDINGS]
     named = [topic for topic in possible if pair.stamp in contained.get(topic, ())]
     if len(named) == len(makers):
-        return [(pair.stamp, topic, make) for topic, make in zip(named, makers, strict=True)]
+        return [(pair.stamp, topic, Deferred(make)) for topic, make in zip(named, makers, strict=True)]
     messages = [make() for make in makers]
     named = [topic + ENDINGS[hasattr(message, "format")] for topic, message in zip(topics, messages, strict=True)]
     return [(pair.stamp, topic, message) for topic, message in zip(named, messages, strict=True)]

@@ -120,11 +120,15 @@ def score(result: Path, truth: Path, whole: bool = True) -> Score:
     >>> score(Path("out.mcap"), Path("traverse.mcap")).disparity["bad_1"]  # doctest: +SKIP
     0.0312
     """
-    tally = _Tally(Path(result), Path(truth))
-    results = iter_decoded(Path(result), [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])
-    lost, near = tally.lost[str(truth)], TimeRange() if whole else tally.part.widened(MAX_LATENESS_NS)
-    mounts = iter_decoded(Path(truth), ["/tf_static"], lost) if near.edges else ()
-    truths = chain(mounts, iter_decoded(Path(truth), [*TRUTHS, "/tf_static"], lost, (near.low, near.high)))
+    result, truth = Path(result), Path(truth)
+    with McapFile(result), McapFile(truth) as log:  # without topics that have no message, unless messages were lost
+        topics = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}
+        part = TimeRange.after(log.start, *part_run(result, truth))
+    tally = _Tally(result, truth, topics, part, stamps_run(result))
+    results = iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])
+    lost, near = tally.lost[str(truth)], TimeRange() if whole else part.widened(MAX_LATENESS_NS)
+    mounts = iter_decoded(truth, ["/tf_static"], lost) if near.edges else ()
+    truths = chain(mounts, iter_decoded(truth, [*TRUTHS, "/tf_static"], lost, (near.low, near.high)))
     for stamp, frame in frames(results, tally.noted(truths)):
         if stamp in tally.outside and not frame.keys() & {*RESULTS}:
             tally.found.beyond += 1
@@ -138,20 +142,18 @@ def score(result: Path, truth: Path, whole: bool = True) -> Score:
 
 
 class _Tally:
-    """Sums up frames, and keeps one row of metrics of each."""
+    """Sums up frames, and keeps one row of metrics of each.
 
-    def __init__(self, result: Path, truth: Path) -> None:
-        self.result, self.truth = result, truth
+    truths: topics of the truth; part: of the log that was run; taken: stamps of the frames that it took, None for all.
+    """
+
+    def __init__(self, result: Path, truth: Path, truths: set[str], part: TimeRange, taken: set[int] | None) -> None:
+        self.result, self.truth, self.truths, self.part, self.taken = result, truth, truths, part, taken
         self.found = Score()
         self.mounts: dict[str, Any] = {}
         self.fitting = False  # whether a map of any frame was scored
         self.left_out: set[str] = set()  # topics of the current frame
         self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
-        with McapFile(truth) as log:  # without topics that have no message, unless messages were lost
-            self.truths = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}
-            with McapFile(result):  # raises LogError for another file
-                self.part = TimeRange.after(log.start, *part_run(result, truth))
-        self.taken = stamps_run(result)
         self.outside: set[int] = set()  # stamps of the truth outside the part that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
