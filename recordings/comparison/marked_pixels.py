@@ -37,7 +37,7 @@ def write_marked(path: Path, image: Array, pixels: Array, title: str) -> None:
         zoomed = cv2.resize(part, (height, height), interpolation=cv2.INTER_NEAREST)
         rgb = np.hstack([rgb, np.full((height, 8, 3), 255, np.uint8), zoomed])
     with written(path) as temporary:
-        temporary.write_bytes(_named(png(page_of(rgb, title, beside=1))))
+        temporary.write_bytes(_named(png(page_of(rgb, title, beside=1).pixels)))
 
 
 def _around(rgb: Array, rows: Array, cols: Array) -> Array:

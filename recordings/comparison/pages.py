@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from recordings.comparison.measures import GridLayers, on_one_grid, verdicts_on_one_grid
-from recordings.export.page_layout import add_bar, add_legend, map_page, page_of, with_rover
+from recordings.export.page_layout import Page, add_bar, add_legend, map_page, page_of, with_rover
 from recordings.export.png_pages import disparity_page, relief_page, verdict_page
 from recordings.png import png
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_layers, read_occupancy_grid
@@ -31,8 +31,8 @@ FLIPS = {
 }
 
 
-def pages(schema: str, one: Any, other: Any) -> tuple[Array, Array, Array] | None:
-    """A, B, and B less A as RGB pages with one extent and one scale; None for a type without pages.
+def pages(schema: str, one: Any, other: Any) -> tuple[Page, Page, Page] | None:
+    """A, B, and B less A as pages with one extent and one scale; None for a type without pages.
 
     schema: full ROS 2 name of the type of the decoded messages.
     """
@@ -48,7 +48,7 @@ def error_page(estimate: Array, truth: Array) -> bytes | None:
     page = page_of(_change_colors(truth, estimate, DISPARITY_LIMIT), "error of the disparity, px")
     others = {1: ("not found", ONLY_ONE[1][1]), 2: ("no truth", ONLY_ONE[2][1])}
     add_bar(page, -DISPARITY_LIMIT, DISPARITY_LIMIT, lambda values: signed_colors(values, DISPARITY_LIMIT), others)
-    return png(page)
+    return png(page.pixels)
 
 
 def signed_colors(change: Array, limit: float) -> Array:
@@ -59,7 +59,7 @@ def signed_colors(change: Array, limit: float) -> Array:
     return rgb
 
 
-def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array] | None:
+def _disparities(one: Any, other: Any) -> tuple[Page, Page, Page] | None:
     first, second = read_disparity(one), read_disparity(other)
     if first.shape != second.shape:
         return None
@@ -69,7 +69,7 @@ def _disparities(one: Any, other: Any) -> tuple[Array, Array, Array] | None:
     return disparity_page(first, limit), disparity_page(second, limit), page
 
 
-def _elevations(one: Any, other: Any) -> tuple[Array, Array, Array]:
+def _elevations(one: Any, other: Any) -> tuple[Page, Page, Page]:
     maps = [colormaps.terrain_ahead(read_grid_map(message)) for message in (one, other)]
     grids = on_one_grid(*(GridLayers(item.layers, item.origin, item.resolution) for item in maps))
     first, second = (replace(item, **grid._asdict()) for item, grid in zip(maps, grids, strict=True))
@@ -80,7 +80,7 @@ def _elevations(one: Any, other: Any) -> tuple[Array, Array, Array]:
     return relief_page(first, limits), relief_page(second, limits), page
 
 
-def _verdicts(one: Any, other: Any) -> tuple[Array, Array, Array]:
+def _verdicts(one: Any, other: Any) -> tuple[Page, Page, Page]:
     maps = (colormaps.navigation_ahead(read_occupancy_grid(message)) for message in (one, other))
     first, second = verdicts_on_one_grid(*maps)
     before, after = first.cells, second.cells
@@ -98,13 +98,13 @@ def _change_colors(one: Array, other: Array, limit: float) -> Array:
     return rgb
 
 
-def _map(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Array:
+def _map(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Page:
     """A page of a map's cells."""
     extended, corner = with_rover(rgb, grid, colormaps.UNKNOWN_RGB)
     return map_page(extended, grid.resolution, corner, f"{title} ({grid.frame_id})")
 
 
-_PAGES: Mapping[str, Callable[[Any, Any], tuple[Array, Array, Array] | None]] = {
+_PAGES: Mapping[str, Callable[[Any, Any], tuple[Page, Page, Page] | None]] = {
     "stereo_msgs/msg/DisparityImage": _disparities,
     _GRID_MAP: _elevations,
     "nav_msgs/msg/OccupancyGrid": _verdicts,

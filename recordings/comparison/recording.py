@@ -120,4 +120,4 @@ def _beside(path: str, variant: str) -> rrb.Container:
 def _drawn(change: MessageDifference) -> tuple[bytes, ...]:
     """The pages of a difference as PNG files; none for a type without pages."""
     found = pages(full_name(change.one.__msgtype__), change.one, change.other)
-    return () if found is None else tuple(map(png, found))
+    return () if found is None else tuple(png(page.pixels) for page in found)

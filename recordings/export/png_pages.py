@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.export.page_layout import add_bar, add_legend, map_page, page_of, with_rover
+from recordings.export.page_layout import Page, add_bar, add_legend, map_page, page_of, with_rover
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.png import png
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
@@ -38,12 +38,12 @@ def draw(result: Path, out: Path) -> list[Path]:
         if stamp in chosen:
             name, page_of = PAGES[topic]
             path = out / f"frame-{chosen[stamp]:04d}-{name}.png"
-            path.write_bytes(png(page_of(message)))
+            path.write_bytes(png(page_of(message).pixels))
             written.append(path)
     return sorted(written)
 
 
-def disparity_page(disparity: Array, limit: float | None = None) -> Array:
+def disparity_page(disparity: Array, limit: float | None = None) -> Page:
     """Disparities (H, W), px, NaN = unknown, as an RGB page with a colour bar from 0 to a limit."""
     limit = colormaps.disparity_limit(disparity) if limit is None else limit
     page = page_of(colormaps.disparity_colors(disparity, limit), "disparity, px")
@@ -51,13 +51,13 @@ def disparity_page(disparity: Array, limit: float | None = None) -> Array:
     return page
 
 
-def elevation_page(terrain: ElevationMap) -> Array:
+def elevation_page(terrain: ElevationMap) -> Page:
     """Shaded relief of a terrain as an RGB page with coordinates and a colour bar."""
     terrain = colormaps.terrain_ahead(terrain)
     return relief_page(terrain, colormaps.elevation_limits(terrain.layers["elevation"]))
 
 
-def relief_page(terrain: ElevationMap, limits: tuple[float, float]) -> Array:
+def relief_page(terrain: ElevationMap, limits: tuple[float, float]) -> Page:
     """The same of all of a terrain, with a colour bar over `limits`, m."""
     low, high = limits
     rgb, origin = with_rover(colormaps.elevation_colors(terrain, (low, high)), terrain, colormaps.UNKNOWN_RGB)
@@ -66,12 +66,12 @@ def relief_page(terrain: ElevationMap, limits: tuple[float, float]) -> Array:
     return page
 
 
-def navigation_page(navigation: NavigationMap) -> Array:
+def navigation_page(navigation: NavigationMap) -> Page:
     """A navigation map as an RGB page with coordinates and a legend."""
     return verdict_page(colormaps.navigation_ahead(navigation))
 
 
-def verdict_page(navigation: NavigationMap) -> Array:
+def verdict_page(navigation: NavigationMap) -> Page:
     """The same of all of a navigation map."""
     colors = colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND)
     rgb, origin = with_rover(colors, navigation, colormaps.CELL_LEGEND[Cell.UNKNOWN][1])
@@ -80,7 +80,7 @@ def verdict_page(navigation: NavigationMap) -> Array:
     return page
 
 
-PAGES: Mapping[str, tuple[str, Callable[[Any], Array]]] = {
+PAGES: Mapping[str, tuple[str, Callable[[Any], Page]]] = {
     "/nav/disparity": ("disparity", lambda message: disparity_page(read_disparity(message))),
     "/nav/elevation_map": ("elevation", lambda message: elevation_page(read_grid_map(message))),
     "/nav/navigation_map": ("navigation", lambda message: navigation_page(read_occupancy_grid(message))),

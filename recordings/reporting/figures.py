@@ -10,8 +10,7 @@ from html import escape
 import cv2
 import numpy as np
 
-from recordings.export.page_layout import round_step
-from stages.data import Array
+from recordings.export.page_layout import Page, round_step
 
 WIDTH, HEIGHT, MARGIN = 480, 180, 52
 MAX_WIDTH = 900  # px of a picture
@@ -41,12 +40,13 @@ def track_plot(title: str, tracks: Mapping[str, Sequence[tuple[float, float]]]) 
     return _plot(title, tracks, spans[0], spans[1], "m")
 
 
-def picture(page: Array, alt: str) -> str:
-    """A page, RGB, as an embedded JPEG image."""
-    if page.shape[1] > MAX_WIDTH:
-        scale = MAX_WIDTH / page.shape[1]
-        page = cv2.resize(page, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    _, blob = cv2.imencode(".jpg", cv2.cvtColor(page, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])
+def picture(page: Page, alt: str) -> str:
+    """A page as an embedded JPEG image."""
+    pixels = page.pixels
+    if pixels.shape[1] > MAX_WIDTH:
+        scale = MAX_WIDTH / pixels.shape[1]
+        pixels = cv2.resize(pixels, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    _, blob = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])
     data = base64.b64encode(blob.tobytes()).decode()
     return f'<img alt="{escape(alt)}" src="data:image/jpeg;base64,{data}">'
 

@@ -16,12 +16,13 @@ from recordings.comparison.diff import diff
 from recordings.comparison.text import format_diff, moment
 from recordings.errors import LogError
 from recordings.export.bundle import MapFiles
+from recordings.export.page_layout import Page
 from recordings.export.png_pages import PAGES, relief_page, verdict_page
 from recordings.reporting.figures import MAX_WIDTH, line_plot, picture, track_plot
 from recordings.reporting.run_facts import RunFacts, read_facts
 from recordings.sinks.colormaps import elevation_limits
 from recordings.sinks.overwrite import REPORT
-from stages.data import Array, ElevationMap, NavigationMap
+from stages.data import ElevationMap, NavigationMap
 
 MAX_LOSSES = 100  # rows of the table
 MAX_REGIONS = 6  # frames of reference whose maps are drawn
@@ -112,7 +113,7 @@ def _regional(facts: RunFacts) -> str:
     return "".join([f"<div class=pictures>{''.join(pictures)}</div>" if pictures else "", *notes])
 
 
-def _region_pages(maps: MapFiles) -> Iterator[tuple[str, Array]]:
+def _region_pages(maps: MapFiles) -> Iterator[tuple[str, Page]]:
     """Name and page of the elevation map and the navigation map."""
     if (terrain := maps.elevation) is not None:
         heights, size = terrain.overview("elevation", MAX_WIDTH)

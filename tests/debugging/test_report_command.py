@@ -83,7 +83,7 @@ def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_pat
     assert [name for name, _ in images] == ["regional elevation map"] * 2
     for (_, data), whole in zip(images, drawn, strict=True):
         pixels = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-        page = relief_page(whole, elevation_limits(whole.layers["elevation"]))
+        page = relief_page(whole, elevation_limits(whole.layers["elevation"])).pixels
         page = cv2.resize(page, pixels.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.abs(page.astype(float) - pixels).mean() < 2
 

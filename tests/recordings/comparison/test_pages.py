@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from recordings.comparison.pages import FLIPS, ONLY_ONE, pages
-from recordings.export.page_layout import margin_of, page_of
+from recordings.export.page_layout import page_of
 from recordings.export.png_pages import relief_page, verdict_page
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from recordings.sinks import colormaps
@@ -35,18 +35,20 @@ def test_maps_of_other_extent_and_height_are_drawn_on_one_grid_with_one_scale():
         np.concatenate([whole["elevation"].ravel(), np.ravel(other.layers["elevation"])])
     )
     expected = relief_page(ElevationMap(STAMP, whole, 0.5, (1.0, -2.0), "odom"), limits)
-    np.testing.assert_array_equal(drawn[0], expected)
-    np.testing.assert_array_equal(drawn[1], relief_page(other, limits))
-    assert drawn[2].shape == expected.shape
-    assert (drawn[2] == ONLY_ONE[2][1]).all(2).mean() > 0.2
+    np.testing.assert_array_equal(drawn[0].pixels, expected.pixels)
+    np.testing.assert_array_equal(drawn[1].pixels, relief_page(other, limits).pixels)
+    assert drawn[2].pixels.shape == expected.pixels.shape
+    assert (drawn[2].pixels == ONLY_ONE[2][1]).all(2).mean() > 0.2
 
 
 def test_maps_of_other_cells_lie_on_each_other():
     coarse, fine = navigation([[0, 100], [0, 0]], step=1.0), navigation(np.zeros((4, 4)))
     drawn = pages(GRID, occupancy_grid(coarse), occupancy_grid(fine))
     assert drawn is not None
-    np.testing.assert_array_equal(drawn[0], verdict_page(navigation(np.kron(coarse.cells, np.ones((2, 2), np.int8)))))
-    freed, same = ((drawn[2] == FLIPS[code][1]).all(2).sum() for code in (1, 0))
+    np.testing.assert_array_equal(
+        drawn[0].pixels, verdict_page(navigation(np.kron(coarse.cells, np.ones((2, 2), np.int8)))).pixels
+    )
+    freed, same = ((drawn[2].pixels == FLIPS[code][1]).all(2).sum() for code in (1, 0))
     assert freed == pytest.approx(same / 3, rel=0.05)
 
 
@@ -57,7 +59,7 @@ def test_disparities_have_one_scale_and_those_of_other_size_no_page():
 
     drawn = pages(DISPARITY, message(48, 30.0), message(48, 120.0))
     assert drawn is not None
-    bars = [page[:, -3 * margin_of(page) :] for page in drawn[:2]]
+    bars = [pixels[:, -3 * margin :] for pixels, margin in drawn[:2]]
     np.testing.assert_array_equal(*bars)
     assert pages(DISPARITY, message(48, 30.0), message(40, 30.0)) is None
 
@@ -65,13 +67,12 @@ def test_disparities_have_one_scale_and_those_of_other_size_no_page():
 def test_a_cell_that_turned_unknown_is_marked():
     drawn = pages(GRID, occupancy_grid(navigation([[0, Cell.HAZARD]])), occupancy_grid(navigation([[0, -1]])))
     assert drawn is not None
-    assert (drawn[2] == FLIPS[3][1]).all(2).sum() > 100
+    assert (drawn[2].pixels == FLIPS[3][1]).all(2).sum() > 100
 
 
 @pytest.mark.parametrize("width", [160, 320, 641, 900, 1280, 2560])
 def test_letters_are_legible_where_three_pages_share_a_window(width):
-    page = page_of(np.full((60, width, 3), 128, np.uint8), "N")
-    margin = margin_of(page)
+    page, margin = page_of(np.full((60, width, 3), 128, np.uint8), "N")
     assert page.shape[1] == width + 4 * margin
     rows = np.flatnonzero((page[:margin] < 100).all(2).any(1))
     height = np.ptp(rows) * min(1.0, 1600 / 3 / page.shape[1])

@@ -5,7 +5,7 @@ import numpy as np
 
 from recordings.comparison.pages import ONLY_ONE, error_page, signed_colors
 from recordings.comparison.truth import error_pages
-from recordings.export.page_layout import margin_of
+from recordings.export.page_layout import MARGIN_STEP, MIN_STEPS
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, stamp_of
 
@@ -17,7 +17,8 @@ def test_a_page_shows_by_how_much_and_where_a_disparity_is_wrong():
     png = error_page(estimate, truth)
     assert png is not None
     page = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    drawn = page[margin_of(page) :, margin_of(page) :][:60, :80]
+    margin = MARGIN_STEP * MIN_STEPS  # of a small picture
+    drawn = page[margin:, margin:][:60, :80]
     for place, expected in (((30, 10), 0.5), ((30, 70), -0.25)):
         assert drawn[place].tolist() == signed_colors(np.array([expected]), 1.0)[0].tolist()
     assert (tuple(drawn[5, 5]), tuple(drawn[55, 5])) == (ONLY_ONE[1][1], ONLY_ONE[2][1])

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.errors import LogError
-from recordings.export.page_layout import margin_of
+from recordings.export.page_layout import Page
 from recordings.export.png_pages import disparity_page, draw, elevation_page, navigation_page
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
@@ -57,11 +57,11 @@ def result(tmp_path: Path) -> Path:
     return path
 
 
-def cells_of(page: Array) -> Array:
+def cells_of(page: Page) -> Array:
     """The colours at the middles of the cells of a painted map, (COLS, ROWS, 3): x downwards, y to the left."""
-    margin = margin_of(page)
-    zoom = (page.shape[0] - 2 * margin) // COLS
-    return page[margin + zoom // 2 :: zoom, margin + zoom // 2 :: zoom][:COLS, :ROWS]
+    pixels, margin = page
+    zoom = (pixels.shape[0] - 2 * margin) // COLS
+    return pixels[margin + zoom // 2 :: zoom, margin + zoom // 2 :: zoom][:COLS, :ROWS]
 
 
 def test_ahead_is_up_and_left_is_left():
@@ -81,7 +81,7 @@ def test_a_cropped_map_is_drawn_at_its_place_beside_the_rover():
     whole = np.full((4, COLS), Cell.UNKNOWN, np.int8)  # from the rover's place on
     whole[2:, 3:] = Cell.HAZARD
     expected = NavigationMap(START, whole, np.zeros(whole.shape, np.uint8), 0.5, (0.0, 0.0), LEVEL_FRAME)
-    np.testing.assert_array_equal(navigation_page(cropped), navigation_page(expected))
+    np.testing.assert_array_equal(navigation_page(cropped).pixels, navigation_page(expected).pixels)
 
 
 def test_terrain_brightens_with_height_and_holes_stay_holes():
@@ -92,8 +92,8 @@ def test_terrain_brightens_with_height_and_holes_stay_holes():
 
 
 def test_near_is_red_far_is_blue_unknown_is_neither():
-    page = disparity_page(disparity().pixels)
-    picture = page[margin_of(page) :, margin_of(page) :]
+    page, margin = disparity_page(disparity().pixels)
+    picture = page[margin:, margin:]
     near, far = picture[46, 40].astype(int), picture[8, 40].astype(int)
     assert near[0] > near[2]
     assert far[2] > far[0]
@@ -117,7 +117,7 @@ def test_a_picture_from_the_log_is_the_picture_of_the_data(result, tmp_path):
     for name, picture in pictures.items():
         file = files[f"frame-0000-{name}.png"]
         assert file is not None
-        np.testing.assert_array_equal(file[..., ::-1], picture)
+        np.testing.assert_array_equal(file[..., ::-1], picture.pixels)
 
 
 def test_a_log_without_results_is_named(tmp_path):
@@ -130,9 +130,9 @@ def test_a_log_without_results_is_named(tmp_path):
 
 def test_a_map_without_known_cells_is_drawn():
     nothing = np.full((ROWS, COLS), np.nan, np.float32)
-    page = elevation_page(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
-    assert (cells_of(page)[:-1] == colormaps.UNKNOWN_RGB).all()
-    page, margin = disparity_page(nothing), margin_of(disparity_page(nothing))
+    drawn = elevation_page(ElevationMap(START, {"elevation": nothing}, 0.5, (0.0, -1.5), LEVEL_FRAME))
+    assert (cells_of(drawn)[:-1] == colormaps.UNKNOWN_RGB).all()
+    page, margin = disparity_page(nothing)
     assert (page[margin : margin + ROWS, margin : margin + COLS] == colormaps.UNKNOWN_RGB).all()
 
 
