@@ -140,7 +140,7 @@ def _plots(facts: Sequence[RunFacts]) -> str:
         plots.append(line_plot(name, curves))
     for frame_id in dict.fromkeys(frame_id for found in facts for frame_id in found.tracks):
         tracks = {found.path.name: found.tracks.get(frame_id, []) for found in facts}
-        plots.append(track_plot(f"way driven in {frame_id}, x to the right, y up, m", tracks))
+        plots.append(track_plot(f"way in {frame_id}, x right, y up, m", tracks))
     return f"<div class=pictures>{''.join(plots)}</div>"
 
 
