@@ -10,7 +10,7 @@ import numpy as np
 
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
-from recordings.source.cameras import CAMERAS, CalibrationTopic
+from recordings.source.cameras import CAMERAS, CalibrationTopic, some_image
 from recordings.source.topics import DecodedTopics
 from recordings.source.transforms import TransformTree, rigid
 from stages.data import CameraModel
@@ -64,8 +64,8 @@ def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraMod
     """The calibration, with the size of the images where its file has none."""
     if model.width and model.height:
         return model
-    pixels_of = messages.pixel_reader(topic)
-    first = messages.first(topic, lambda message: pixels_of(message, None).shape)
-    if isinstance(first, LogError):
-        raise LogError(f"the calibration has no size of the images, and no image of {topic} can be read: {first}")
-    return replace(model, width=int(first[1]), height=int(first[0]), k=np.array(model.k))
+    pixels = some_image(messages, topic)
+    if not isinstance(pixels, np.ndarray):
+        why = "it has no messages" if pixels is None else pixels
+        raise LogError(f"the calibration has no size of the images, and no image of {topic} can be read: {why}")
+    return replace(model, width=pixels.shape[1], height=pixels.shape[0])

@@ -24,9 +24,8 @@ from recordings.discovery.tilt import find_tilt
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of
 from recordings.source.settings import LogSettings
-from recordings.source.topics import DecodedTopics
+from recordings.source.topics import MAX_TRIED, DecodedTopics
 
-_MAX_TRANSFORMS = 200  # messages of each part of a log that are looked at, as many place other frames
 _MAX_LISTED = 5  # frames in a sentence
 _TRUTH = "/truth/"  # the simulator's ground truth, used only if a setting names it
 
@@ -87,7 +86,7 @@ def _find_pose(
 def _no_pose_reason(messages: DecodedTopics, settings: LogSettings) -> str | None:
     """Why the transforms on the set topic are not the pose of the base frame; None if they are."""
     base, parents = settings.base_frame, dict[str, set[str]]()
-    for message in messages.sample(str(settings.odometry), lambda message: message.transforms, _MAX_TRANSFORMS):
+    for message in messages.sample(str(settings.odometry), lambda message: message.transforms, MAX_TRIED):
         for item in [] if isinstance(message, LogError) else message:
             parents.setdefault(frame_name(item.child_frame_id), set()).add(frame_of(item))
     if base not in parents:

@@ -110,14 +110,14 @@ def mismatched_images(
 
     They cannot be read anywhere in the log, or the first and the last do not fit the calibration or the other side.
     """
-    first = _mismatches({side: _pixels(messages, topics[side]) for side in CAMERAS}, topics, infos)
+    first = _mismatches({side: some_image(messages, topics[side]) for side in CAMERAS}, topics, infos)
     if not first:
         return {}
-    last = _mismatches({side: _pixels(messages, topics[side], last=True) for side in CAMERAS}, topics, infos)
+    last = _mismatches({side: some_image(messages, topics[side], last=True) for side in CAMERAS}, topics, infos)
     return {side: why for side, why in first.items() if side in last}
 
 
-def _pixels(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
+def some_image(messages: DecodedTopics, topic: str, last: bool = False) -> Array | LogError | None:
     """The first (or last) image that can be decoded, or the last error; None without messages."""
     found, pixels_of = None, messages.pixel_reader(topic)
     some = messages.each if isinstance(pixels_of, VideoDecoder) else messages.last if last else messages.sample

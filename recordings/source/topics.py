@@ -30,6 +30,7 @@ STAMPED_SCHEMAS = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Qua
 _RATE_SECONDS = 10  # over which the rate of a topic is a mean, as recorders write late messages in bursts
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
+MAX_TRIED = 200  # likewise, where one suffices; most transforms on /tf may be of other frames
 
 _MAX_WAITING_BYTES = 200_000_000  # of messages while calibrations and transforms are read ahead
 _ITEM_BYTES = 1000  # of a message that waits, beside its data
@@ -174,7 +175,7 @@ class DecodedTopics:
         """Convert the first message, or the first of a sample for which this succeeds; otherwise the LogError."""
         made = next(self.each(topic, make), LogError(f"{topic} has no messages"))
         if isinstance(made, LogError):
-            made = next((each for each in self.sample(topic, make) if not isinstance(each, LogError)), made)
+            made = next((each for each in self.sample(topic, make, MAX_TRIED) if not isinstance(each, LogError)), made)
         return made
 
     def frame_of(self, topic: str) -> str:
