@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -48,27 +48,17 @@ class SourceResolution:
         self.undecodable = self._undecodable_topics()
         found = self._discovered()
         self.chosen, self.why, self.remedies = found.chosen, found.why, found.remedies
+        self.unavailable, self.refused = dict(found.missing), dict(found.refused)
         self._without_topic = frozenset(found.missing)  # streams without a topic
-        self.static, files = TransformTree(), source.calibration
-        of_files = calibrations_of_files(files, self.messages, found.chosen, self.static) if files else {}
-        self.problems = self._read_static()
-        self.infos, unread = (of_files, {}) if files else first_calibrations(self.messages, found.chosen)
-        self.cameras, self.baseline_note, unpaired = self._paired(found.chosen)
-        unavailable = found.missing | unread | unpaired
-        self.tilt, unread = self._tilt_reading(found)
-        unavailable |= unread
-        self.moving: MovingMount | None = None
-        self.refused: dict[str, str] = {}
-        self.tilt_frame, self.mount, unmounted = self._mounted(found.chosen, unavailable)
-        moving = self._moving_pose(found.chosen)
-        self.refused |= found.refused | (moving if self.source.odometry else {}) | self._unjoined_base()
-        self.refused |= self._fixed_rotation()
-        unavailable |= unmounted | moving
-        if all(side in self.infos and side not in unavailable for side in CAMERAS):
-            unavailable |= mismatched_images(self.messages, found.chosen, self.infos)
-        self.unavailable = unavailable
+        self._resolve_cameras()
+        self._resolve_tilt(found.tilt)
+        self._resolve_mount()
+        self._check_base_frame()
+        self._resolve_pose()
+        if all(side in self.infos and side not in self.unavailable for side in CAMERAS):
+            self.unavailable |= mismatched_images(self.messages, self.chosen, self.infos)
         self.topics = {
-            role: topic for role, topic in found.chosen.items() if role in _STREAMS and role not in unavailable
+            role: topic for role, topic in self.chosen.items() if role in _STREAMS and role not in self.unavailable
         }
         self.problems += self._undecodable_messages()
 
@@ -150,85 +140,110 @@ class SourceResolution:
             notes.append(("mount", self.moving.note))
         return notes
 
-    def _paired(self, chosen: Mapping[str, str]) -> tuple[tuple[Camera, Camera] | None, Finding | None, dict[str, str]]:
-        """The calibrated pair, the note on its baseline, and side -> why there is no pair."""
+    def _resolve_cameras(self) -> None:
+        """The static transforms, the calibrations and the pair."""
+        self.static, files = TransformTree(), self.source.calibration
+        of_files = calibrations_of_files(files, self.messages, self.chosen, self.static) if files else {}
+        self.problems = self._read_static()
+        self.infos, unread = (of_files, {}) if files else first_calibrations(self.messages, self.chosen)
+        self.unavailable |= unread
+        self.cameras: tuple[Camera, Camera] | None = None
+        self.baseline_note: Finding | None = None
         if len(self.infos) < len(CAMERAS):
-            return None, None, {}
+            return
         left, right = (self.infos[side] for side in CAMERAS)
         models, names = (left.model, right.model), (left.frame_id, right.frame_id)
-        cameras = attempt(calibrated_pair, models, names, (chosen["left"], chosen["right"]), self.static)
-        if isinstance(cameras, LogError):
-            return None, None, dict.fromkeys(CAMERAS, str(cameras))
-        if self.source.calibration is not None:
-            return cameras, Finding(f"the calibration is that of {self.infos['left'].topic}"), {}
-        return cameras, baseline_note(cameras, models, names, self.static), {}
+        pair = attempt(calibrated_pair, models, names, (self.chosen["left"], self.chosen["right"]), self.static)
+        if isinstance(pair, LogError):
+            self.unavailable |= dict.fromkeys(CAMERAS, str(pair))
+            return
+        self.cameras, self.baseline_note = pair, baseline_note(pair, models, names, self.static)
+        if files:
+            self.baseline_note = Finding(f"the calibration is that of {left.topic}")
 
-    def _mounted(
-        self, chosen: Mapping[str, str], unavailable: Mapping[str, str]
-    ) -> tuple[str, Mount | None, dict[str, str]]:
-        """The inclinometer's frame, the mount, and why it is unknown."""
+    def _resolve_tilt(self, kind: TiltKind) -> None:
+        """How the tilt is read."""
+        self.tilt: TiltReading | None = None
+        topic, gyroscope = self.chosen.get("inclinometer"), self.chosen.get("gyroscope", "")
+        if topic is None:
+            return
+        turn, frames = np.eye(3), (self.messages.frame_of(topic), self.messages.frame_of(gyroscope or topic))
+        if frames[0] != frames[1]:
+            transform = self.static.between(*frames)
+            if transform is None:
+                self.unavailable["inclinometer"] = (
+                    f"no static transform joins the accelerometer ('{frames[0]}', {topic}) and the gyroscope "
+                    f"('{frames[1]}', {gyroscope}); record /tf_static"
+                )
+                return
+            turn = transform.rotation
+        why, is_imu = "", self.messages.schemas[topic] == IMU and self.source.accelerations is None
+        if is_imu and kind != TiltKind.ORIENTATION:
+            why = imu_content(self.messages, topic).no_orientation
+        self.tilt = TiltReading(kind, topic, gyroscope, turn, why)
+
+    def _resolve_mount(self) -> None:
+        """The inclinometer's frame and the mount."""
+        self.tilt_frame = ""
+        self.mount: Mount | None = None
+        self.moving: MovingMount | None = None
         if self.cameras is None:
-            why = next(unavailable[side] for side in CAMERAS if side in unavailable)
-            return "", None, {"mount": f"the mount needs a calibrated pair of cameras: {why}"}
-        if "inclinometer" in unavailable:
-            return "", None, {"mount": f"the mount needs an inclinometer: {unavailable['inclinometer']}"}
-        frame = self._inclinometer_frame(chosen["inclinometer"])
+            why = next(self.unavailable[side] for side in CAMERAS if side in self.unavailable)
+            self.unavailable["mount"] = f"the mount needs a calibrated pair of cameras: {why}"
+            return
+        if "inclinometer" in self.unavailable:
+            self.unavailable["mount"] = f"the mount needs an inclinometer: {self.unavailable['inclinometer']}"
+            return
+        self.tilt_frame = frame = self._inclinometer_frame(self.chosen["inclinometer"])
         given, base = self.source.camera_from_inclinometer, self.source.base_frame
         joints = attempt(read_joints, self.source.joints) if self.source.joints is not None else {}
         if isinstance(joints, LogError):
-            self.refused |= {"joints": str(joints)}
+            self.refused["joints"] = str(joints)
             joints = {}
         self.moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static, joints)
         if self.moving is None:
             mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
         else:
             mount = attempt(self.moving.first)
-        if isinstance(mount, LogError):
-            if joints and (others := other_joints(self.messages, joints)):
-                unknown = f"{self.source.joints} has only joints that the log has no angles of"
-                self.refused |= {"joints": f"{unknown}; {others}"}
-            quaternion = "with the rotation from inclinometer to left camera, x, y, z, w"
-            self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0, 0, 0, 1]}, quaternion)]
-            return frame, None, {"mount": str(mount)}
-        return frame, mount, {}
+            if given is not None:
+                self.refused["camera_from_inclinometer"] = (
+                    f"the source's 'camera_from_inclinometer' is a fixed rotation, but {self.moving.note}; remove the "
+                    "setting, and record the transform of the inclinometer"
+                )
+        if not isinstance(mount, LogError):
+            self.mount = mount
+            return
+        if joints and (others := other_joints(self.messages, joints)):
+            self.refused["joints"] = f"{self.source.joints} has only joints that the log has no angles of; {others}"
+        quaternion = "with the rotation from inclinometer to left camera, x, y, z, w"
+        self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0, 0, 0, 1]}, quaternion)]
+        self.unavailable["mount"] = str(mount)
 
-    def _fixed_rotation(self) -> dict[str, str]:
-        """Why the source's 'camera_from_inclinometer' is wrong: the camera moves."""
-        if self.moving is None or self.source.camera_from_inclinometer is None:
-            return {}
-        return {
-            "camera_from_inclinometer": f"the source's 'camera_from_inclinometer' is a fixed rotation, but "
-            f"{self.moving.note}; remove the setting, and record the transform of the inclinometer"
-        }
-
-    def _unjoined_base(self) -> dict[str, str]:
-        """Why the source's 'base_frame' is wrong, if the camera is joined to other frames but not to it."""
+    def _check_base_frame(self) -> None:
+        """Refuse the source's 'base_frame' if the camera is joined to other frames but not to it."""
         base = self.source.base_frame
         if base == type(self.source).base_frame or self.mount is None or self.mount.base_from_camera is not None:
-            return {}
+            return
         assert self.cameras is not None  # a mount needs them
         own = {self.tilt_frame, *(camera.frame_id for camera in self.cameras)}
         joined = (name for name in self.static.edges if self.static.between(name, self.cameras[0].frame_id) is not None)
-        others = ", ".join(f"'{name}'" for name in sorted(set(joined) - own))
-        if not others:
-            return {}
-        return {
-            "base_frame": f"the source's 'base_frame' is set to '{base}', but /tf_static joins the camera to {others} "
-            "only; set it to one of these, or record how the camera sits on it"
-        }
+        if others := ", ".join(f"'{name}'" for name in sorted(set(joined) - own)):
+            self.refused["base_frame"] = (
+                f"the source's 'base_frame' is set to '{base}', but /tf_static joins the camera to {others} only; set "
+                "it to one of these, or record how the camera sits on it"
+            )
 
-    def _moving_pose(self, chosen: Mapping[str, str]) -> dict[str, str]:
-        """Why the poses cannot be used: their frame moves with the rover, or nothing joins the camera to theirs."""
-        if self.cameras is None or "odometry" not in chosen:
-            return {}
-        topic, camera, image = chosen["odometry"], self.cameras[0].frame_id, self.cameras[0].image_frame
+    def _resolve_pose(self) -> None:
+        """Whether the poses can be used: in a fixed frame, of a frame that is joined to the camera."""
+        if self.cameras is None or "odometry" not in self.chosen:
+            return
+        topic, camera, image = self.chosen["odometry"], self.cameras[0].frame_id, self.cameras[0].image_frame
         pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
         if isinstance(pose, LogError):
-            return {}
+            return
         of, fixed = pose.child_frame_id, pose.frame_id
         moving = pose_of_base(pose, self.cameras[0], self.source.base_frame, self.static).child_frame_id
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
-        why = ""
         if fixed in (LEVEL_FRAME, image, of, moving) or self.static.between(fixed, camera) is not None:
             why = f"{topic} is a pose in the frame '{fixed}', which moves with the rover; record it in a fixed frame"
         elif moving not in (camera, image) and (base is None or base.parent != moving):
@@ -237,7 +252,11 @@ class SourceResolution:
                 f"{topic} is the pose of '{of}', but no static transform joins it to the camera '{camera}'; record "
                 f"one in /tf_static{'' if of == self.source.base_frame else renamed}"
             )
-        return {"odometry": why} if why else {}
+        else:
+            return
+        self.unavailable["odometry"] = why
+        if self.source.odometry:
+            self.refused["odometry"] = why
 
     def _undecodable_messages(self) -> list[tuple[str, LogError]]:
         """The messages of a used topic in an undecodable channel, as losses of its stream."""
@@ -250,25 +269,6 @@ class SourceResolution:
                 what = f"{topic}: {counted(count, 'message')} of its channel {number} cannot be decoded: {why}"
                 lost.append((streams[topic], LogError(what)))
         return lost
-
-    def _tilt_reading(self, found: DiscoveredTopics) -> tuple[TiltReading | None, dict[str, str]]:
-        """How the tilt is read, and why it cannot be."""
-        topic, gyroscope = found.chosen.get("inclinometer"), found.chosen.get("gyroscope", "")
-        if topic is None:
-            return None, {}
-        turn, frames = np.eye(3), (self.messages.frame_of(topic), self.messages.frame_of(gyroscope or topic))
-        if frames[0] != frames[1]:
-            transform = self.static.between(*frames)
-            if transform is None:
-                why = (
-                    f"no static transform joins the accelerometer ('{frames[0]}', {topic}) and the gyroscope "
-                    f"('{frames[1]}', {gyroscope}); record /tf_static"
-                )
-                return None, {"inclinometer": why}
-            turn = transform.rotation
-        is_imu = self.messages.schemas[topic] == IMU and self.source.accelerations is None
-        why = imu_content(self.messages, topic).no_orientation if is_imu and found.tilt != TiltKind.ORIENTATION else ""
-        return TiltReading(found.tilt, topic, gyroscope, turn, why), {}
 
     def _inclinometer_frame(self, topic: str) -> str:
         """The frame that the tilt is in: that of its messages, or the one whose poses they are."""
