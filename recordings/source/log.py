@@ -366,7 +366,7 @@ class McapLog:
         messages = self.resolution.messages
         decoders = {number: messages.decoders[number] for number in messages.channels_of(topic)}
         pixels_of = item.pixels_of if isinstance(item, ImageReading) else None
-        made = (lambda message, _: item(message, 0)) if messages.ahead_of(topic) else item  # a stamp of 0 is one
+        made = _by_stamp_alone(item) if messages.ahead_of(topic) else item
         return TopicReader(stream, topic, decoders, made, pixels_of if isinstance(pixels_of, VideoDecoder) else None)
 
     def _schema(self, stream: str) -> str:
@@ -376,6 +376,11 @@ class McapLog:
     @staticmethod
     def _by_channel(readers: Iterable[TopicReader]) -> dict[int, TopicReader]:
         return {channel: reader for reader in readers for channel in reader.decoders}
+
+
+def _by_stamp_alone(item: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
+    """The same for stamps of another clock than the log times: a stamp of 0 is one."""
+    return lambda message, log_time: item(message, 0)
 
 
 def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], message: Any, log_time: int) -> Any:
