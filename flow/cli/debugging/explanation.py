@@ -67,6 +67,8 @@ class CellExplanation:
         Of a cell that is UNSURE: why it is not free, though it exceeds no limit.
     turns : list of Turn
         The smallest change of each parameter that would turn the verdict.
+    notes : list of str
+        What differs from the question: another form of the input log, another instant.
     """
 
     stream: str
@@ -79,6 +81,7 @@ class CellExplanation:
     limits: Mapping[str, Limit]
     doubts: list[str]
     turns: list[Turn]
+    notes: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +172,7 @@ def why(
         others = f"no navigation map '{stream}', only {', '.join(rules)}" if rules else "no navigation map"
         raise UsageError(f"the pipeline has {others}")
     graph = graph.upstream_of([stream])
-    with loading_kernels(), input_of(graph, result, log) as opened:
+    with loading_kernels(), input_of(graph, result, log) as (opened, notes):
         items = instant(graph, opened, at)
     if stream not in items:
         raise UsageError(f"the frame has no navigation map '{stream}'; run the log again to see what it lacks")
@@ -189,6 +192,7 @@ def why(
     return Explanation(
         **verdict_at(node.actor, navigation, terrain, place),
         stream=stream,
+        notes=notes,
         recorded=_recorded(result, stream, navigation.stamp, x, y),
         distance=float(np.median(np.linalg.norm(cloud.points[inside] - origin, axis=1))) if inside.any() else math.nan,
         tilt=_last(items, Tilt),

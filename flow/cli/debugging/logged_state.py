@@ -98,16 +98,17 @@ def resume(
     check_profile(result, about)
     if about.get("every"):
         raise UsageError(f"{result} has only the frames of --every {about['every']}; give the result of a whole run")
-    check_input(log, files, result)
+    notes = check_input(log, files, result)
     logged = logged_state(result, graphs["A"], before)
     if logged is None:
-        return 0, {}, [f"{result} has no regional map or visual odometry before the instant, so no stage has a state"]
+        none = f"{result} has no regional map or visual odometry before the instant, so no stage has a state"
+        return 0, {}, [*notes, none]
     states, without = logged.states(graphs, variants)
     sink: Any = sink_of(graphs["A"], ".mcap")
-    notes = [f"state of {', '.join(states) or 'no stage'} from {result}, of {moment(logged.stamp)}"]
+    notes.append(f"state of {', '.join(states) or 'no stage'} from {result}, of {moment(logged.stamp)}")
     if logged.maps and sink.length_step:
         step = 1e3 * sink.length_step
-        notes[0] += f"; the log rounds its heights to {step:.1g} mm and its variances to {100 * sink.precision:g} %"
+        notes[-1] += f"; the log rounds its heights to {step:.1g} mm and its variances to {100 * sink.precision:g} %"
     reasons = dict.fromkeys(without.values())
     notes += [
         f"without state: {', '.join(name for name in without if without[name] == why)} ({why})" for why in reasons

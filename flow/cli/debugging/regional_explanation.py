@@ -16,7 +16,6 @@ import numpy as np
 from flow.cli.debugging.explanation import CellExplanation, centre_of, index_of, verdict_at
 from flow.cli.debugging.instants import Instant, ns_of
 from flow.cli.debugging.result_input import graph_of, input_of
-from flow.cli.report import say
 from flow.errors import UsageError
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
@@ -93,23 +92,24 @@ def why_regional(
     if node is None:
         raise UsageError(f"the pipeline of {result} has no navigation map '{stream}'")
     rule: Any = node.actor
-    begin = 0
+    begin, notes = 0, list[str]()
     if log is None and not isinstance(at, float | int):
         stamp = ns_of(at, int(stamps_of(result)[0]))
     else:
-        with input_of(graph, result, log) as opened:
+        with input_of(graph, result, log) as (opened, notes):
             stamp, begin = ns_of(at, opened.first_stamp), opened.first_stamp
     navigation, terrain, written = _maps(result, stamp, stream, node.inputs["elevation"])
     if navigation.stamp < stamp:
         end = f"{(navigation.stamp - begin) / 1e9:.3f} s" if isinstance(at, float | int) else moment(navigation.stamp)
         last = f"--at is after the last '{stream}', which is explained; it is at {end}"
-        say(f"note: {last if written < stamp else f'the {stream!r} from --at on has only frames up to {end}'}")
+        notes.append(f"note: {last if written < stamp else f'the {stream!r} from --at on has only frames up to {end}'}")
     place = index_of(navigation, *cell)
     if place is None:
         raise UsageError(f"({cell[0]:g}, {cell[1]:g}) is outside the regional map in '{navigation.frame_id}'")
     return RegionalExplanation(
         **verdict_at(rule, navigation, terrain, place),
         stream=stream,
+        notes=notes,
         frame_id=navigation.frame_id,
         frames=_contributions(result, navigation, centre_of(navigation, place)),
         spacing=next((getattr(sink, "point_spacing", 0.0) for _, sink in graph.sinks if sink.suffix == ".mcap"), 0.0),

@@ -43,8 +43,10 @@ def note_damage(result: Path) -> None:
 
 
 @contextmanager
-def input_of(graph: Graph, result: Path, log: Path | str | Sequence[Path | str] | None = None) -> Iterator[McapLog]:
-    """The opened input of a result log: `log`, a file or several, or those that the result names, beside it.
+def input_of(
+    graph: Graph, result: Path, log: Path | str | Sequence[Path | str] | None = None
+) -> Iterator[tuple[McapLog, list[str]]]:
+    """The opened input of a result log, and notes about it: `log`, its files, or what the result names, beside it.
 
     Raises UsageError if it is not there, cannot be read, or has none of the result's frames.
     """
@@ -63,15 +65,15 @@ def input_of(graph: Graph, result: Path, log: Path | str | Sequence[Path | str] 
     with ExitStack() as stack:
         try:
             opened = stack.enter_context(graph.source.open(given))
-            check_input(opened, given, result, "" if log is None else f"; give {named}")
+            notes = check_input(opened, given, result, "" if log is None else f"; give {named}")
         except (LogError, RoverflowError) as error:
             taken = f" (taken for the input because the result names {named}; give --log)" if log is None else ""
             raise UsageError(f"{error}{taken}") from error
-        yield opened
+        yield opened, notes
 
 
-def check_input(opened: McapLog, given: Sequence[Path], result: Path, remedy: str = "") -> None:
-    """Raise UsageError if an opened log has none of the frames of a result log; say if it has other bytes."""
+def check_input(opened: McapLog, given: Sequence[Path], result: Path, remedy: str = "") -> list[str]:
+    """Notes, if an opened log has other bytes than the input of a result log. Raises UsageError for other frames."""
     from recordings.containers.digest import log_digest
     from recordings.containers.finding import find_files
     from recordings.scoring.result_log import about_run, stamps_of
@@ -79,9 +81,9 @@ def check_input(opened: McapLog, given: Sequence[Path], result: Path, remedy: st
     # A log in another form has another digest, and the same stamps.
     digest = about_run(result).get("log_digest")
     if digest == log_digest(find_files(given).files):
-        return
+        return []
     names = ", ".join(map(str, given))
     if is_other(opened, stamps_of(result)):
         raise UsageError(f"{names} is not the input of {result}: its frames have other stamps{remedy}")
-    if digest is not None:
-        say(f"note: {names} is another form of the input of {result}, or another log with its stamps")
+    note = f"note: {names} is another form of the input of {result}, or another log with its stamps"
+    return [] if digest is None else [note]

@@ -79,7 +79,8 @@ def _regional(options: argparse.Namespace) -> int:
     found = why_regional(options.result, options.at, options.cell, log=options.log, stream=options.map)
     verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
     place = f"({found.x:.3f}, {found.y:.3f}) m in '{found.frame_id}'"
-    lines = [f"cell {place}, map of {moment(found.stamp)}: {verdict}, reason {reason}", *_cell_lines(found)]
+    head = f"cell {place}, map of {moment(found.stamp)}: {verdict}, reason {reason}"
+    lines = [*found.notes, head, *_cell_lines(found)]
     conflicts = found.layers.get("contradictions", 0.0)
     more = f"; {conflicts:.0f} contradicted the height" if conflicts > 0 else ""
     thinned = f", thinned to {100 * found.spacing:g} cm" if found.spacing else ""
@@ -97,7 +98,8 @@ def lines_of(found: Explanation) -> list[str]:
     from recordings.comparison.text import moment
 
     verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
-    lines = [f"cell ({found.x:.3f}, {found.y:.3f}) m at {moment(found.stamp)}: {verdict}, reason {reason}"]
+    head = f"cell ({found.x:.3f}, {found.y:.3f}) m at {moment(found.stamp)}: {verdict}, reason {reason}"
+    lines = [*found.notes, head]
     if found.recorded is not None and found.recorded != found.verdict:
         lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or by another version")
     return [*lines, *_cell_lines(found), *_pixel_lines(found), *_tilt_lines(found)]
