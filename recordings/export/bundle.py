@@ -24,14 +24,14 @@ from recordings.errors import LogError, sentence_of
 from recordings.export.georeference import Georeference
 from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
-from recordings.export.mosaic import RIM_WIDTH, STRIP_ROWS, Mosaic
+from recordings.export.mosaic import STRIP_ROWS, Mosaic
 from recordings.export.point_files import CELL_COLOR, add_colors, write_cells, write_points
 from recordings.export.tum import tum_texts
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.result_log import without_results
 from recordings.sinks.colormaps import hillshade
-from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap, Tiles
+from stages.data import LEVEL_FRAME, RIM_WIDTH, Array, Cell, ElevationMap, NavigationMap, Tiles
 
 POINTS = "/nav/points"
 _SCHEMAS = {"elevation": "grid_map_msgs/msg/GridMap", "navigation": "nav_msgs/msg/OccupancyGrid"}

@@ -12,10 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from recordings.errors import LogError
-from stages.data import Array, ElevationMap, NavigationMap, Tiles
+from stages.data import RIM_WIDTH, Array, ElevationMap, NavigationMap, Tiles
 
 MAX_CELLS = 1 << 31  # of a rectangle; readers refuse larger pictures
-RIM_WIDTH = 1.5  # m; slopes and steps are measured over less
 STRIP_ROWS = 256  # that are read at a time, so that no map is in memory as a whole
 _MAX_GRID_OFFSET = 1e-3  # of a cell, by rounding
 

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 
 from recordings.export.bundle import REGIONAL, MapFiles
-from recordings.export.mosaic import RIM_WIDTH
 from recordings.export.png_pages import PAGES
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
 from recordings.scoring.result_log import check_profile, end_of_run, facts_of
-from stages.data import Cell
+from stages.data import RIM_WIDTH, Cell
 
 TOPICS = (*PAGES, "/nav/pose", "/nav/diagnostics", *filter(None, REGIONAL))
 

@@ -13,7 +13,7 @@ from typing import SupportsFloat
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.data import Array, ElevationMap
+from stages.data import Array
 
 MAX_CLOSE_ERROR = 0.05  # m, the height error that the Lunar Autonomy Challenge accepts
 NMAD_SCALE = 1.4826  # from median deviation to standard deviation, for a normal distribution
@@ -24,13 +24,6 @@ MAX_NMAD_ERROR = 1.0  # m; larger errors share a bin
 def share(part: SupportsFloat, whole: SupportsFloat) -> float:
     """part / whole; NaN for a whole of 0."""
     return float(part) / float(whole) if float(whole) else float("nan")
-
-
-def cell_centres(grid: ElevationMap) -> tuple[Array, Array]:
-    """x of each column (cols,) and y of each row (rows,) of a grid, m."""
-    rows, cols = grid.shape
-    left, bottom = grid.origin
-    return left + (np.arange(cols) + 0.5) * grid.resolution, bottom + (np.arange(rows) + 0.5) * grid.resolution
 
 
 def in_ring(radius: Array, low: float, high: float) -> Array:

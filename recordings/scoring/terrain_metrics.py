@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from recordings.scoring.metrics import HeightErrors, cell_centres, in_ring, share, without_plane
-from stages.data import Array, Cell, ElevationMap
+from recordings.scoring.metrics import HeightErrors, in_ring, share, without_plane
+from stages.data import Array, Cell, ElevationMap, cell_centres
 
 MAX_DISTANCE = 8.0  # m from base_link, of cells and rocks
 RINGS = ((0.0, 2.0), (2.0, 4.0), (4.0, 6.0), (6.0, 8.0), (0.0, 4.0), (4.0, 8.0), (0.0, 8.0))  # m from base_link

@@ -15,8 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recordings.scoring.metrics import cell_centres
-from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin
+from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap, PixelOrigin, cell_centres
 
 Rgb = tuple[int, int, int]
 Point = tuple[float, float]

@@ -10,7 +10,6 @@ import rerun as rr
 
 from flow.contracts import counted
 from recordings.png import png
-from recordings.scoring.metrics import cell_centres
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import CAMERA_RGB, MAX_POINTS, Canvas, label_counts
@@ -32,6 +31,7 @@ from stages.data import (
     Tilt,
     TiltHealth,
     VoxelMap,
+    cell_centres,
     known,
 )
 from stages.data.rotations import matrix_of

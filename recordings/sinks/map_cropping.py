@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from recordings.export.mosaic import RIM_WIDTH
-from stages.data import LEVEL_FRAME, Array, Cell, CellReason, ElevationMap, NavigationMap
+from stages.data import LEVEL_FRAME, RIM_WIDTH, Array, Cell, CellReason, ElevationMap, NavigationMap
 from stages.data.arrays import Span, spanned
 
 Grid = tuple[str, tuple[float, float], float, tuple[int, ...]]  # frame, origin, resolution and shape

@@ -13,7 +13,16 @@ from stages.data.arrays import Array
 from stages.data.camera import CameraImage, CameraModel, ImageNoise, StereoCamera, StereoFrame
 from stages.data.cloud import PointCloud, VoxelMap
 from stages.data.disparity import Disparity, MatchHealth
-from stages.data.maps import LEVEL_FRAME, Cell, CellReason, ElevationMap, MatchFailure, NavigationMap
+from stages.data.maps import (
+    LEVEL_FRAME,
+    RIM_WIDTH,
+    Cell,
+    CellReason,
+    ElevationMap,
+    MatchFailure,
+    NavigationMap,
+    cell_centres,
+)
 from stages.data.motion import CameraMotion, Mount, Pose, Tilt, TiltHealth, Transform
 from stages.data.pixel_validity import PixelOrigin, known
 from stages.data.region import Region
@@ -22,6 +31,7 @@ from stages.data.tiles import TILE_SIDE, Tiles
 
 __all__ = [
     "LEVEL_FRAME",
+    "RIM_WIDTH",
     "TILE_SIDE",
     "Array",
     "CameraImage",
@@ -48,5 +58,6 @@ __all__ = [
     "TiltHealth",
     "Transform",
     "VoxelMap",
+    "cell_centres",
     "known",
 ]

@@ -14,6 +14,7 @@ from stages.data.arrays import Array, check_resolution, publish, publish_stamp, 
 from stages.data.motion import Transform
 
 LEVEL_FRAME = "level"
+RIM_WIDTH = 1.5  # m at the edges of a window of a larger map; slopes and steps are measured over less
 
 
 class Cell(IntEnum):
@@ -125,3 +126,10 @@ class NavigationMap:
         check_resolution(self)
         publish(self, "cells", (None, None), np.int8)
         publish(self, "reason", self.cells.shape, np.uint8)
+
+
+def cell_centres(grid: ElevationMap) -> tuple[Array, Array]:
+    """x of each column (cols,) and y of each row (rows,) of a grid, m."""
+    rows, cols = grid.shape
+    left, bottom = grid.origin
+    return left + (np.arange(cols) + 0.5) * grid.resolution, bottom + (np.arange(rows) + 0.5) * grid.resolution
