@@ -136,7 +136,7 @@ class SourceResolution:
                 f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
                 "`points.camera_height` (default 1 m) below the camera and x is its viewing direction"
             )))  # fmt: skip
-        if self.moving is not None and self.mount is not None:
+        if self.moving is not None:
             notes.append(("mount", self.moving.note))
         return notes
 
@@ -200,18 +200,18 @@ class SourceResolution:
         if isinstance(joints, LogError):
             self.refused["joints"] = str(joints)
             joints = {}
-        self.moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static, joints)
-        if self.moving is None:
+        moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static, joints)
+        if moving is None:
             mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
         else:
-            mount = attempt(self.moving.first)
+            mount = attempt(moving.first)
             if given is not None:
                 self.refused["camera_from_inclinometer"] = (
-                    f"the source's 'camera_from_inclinometer' is a fixed rotation, but {self.moving.note}; remove the "
+                    f"the source's 'camera_from_inclinometer' is a fixed rotation, but {moving.note}; remove the "
                     "setting, and record the transform of the inclinometer"
                 )
         if not isinstance(mount, LogError):
-            self.mount = mount
+            self.mount, self.moving = mount, moving
             return
         if joints and (others := other_joints(self.messages, joints)):
             self.refused["joints"] = f"{self.source.joints} has only joints that the log has no angles of; {others}"

@@ -222,6 +222,8 @@ def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
         path = written(tmp_path / f"{messages.__name__}.mcap", messages)
         with McapSource(joints=joints_file).open(path) as log:
             assert log.missing["mount"].startswith(f"no message of {topic} can be used for the mount of the camera; ")
+            assert sum(stream == "left" for _, stream, _ in log.events()) == FRAMES
+            assert log.faults() == {}
 
 
 def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
