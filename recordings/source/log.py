@@ -199,18 +199,21 @@ class McapLog:
                 if reader.stream in CAMERAS
                 else near.has(0, raw.log_time)
             )
-            if is_inside or (reader.video is not None and raw.channel in items):
-                item = noted if raw.channel in infos else reader(raw)
-                if not is_inside:
-                    continue
-                if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
-                    mount = attempt(moving.at, item.stamp)
-                    item = mount if isinstance(mount, LogError) else item
-                    yield from [(raw.log_time, "mount", mount)] if isinstance(mount, Mount) else ()
-                if item is not None:
-                    yield raw.log_time, reader.stream, item
-                if (twin := twins.get(raw.channel)) and (other := twin(raw)) is not None:
-                    yield raw.log_time, twin.stream, other
+            if not is_inside:
+                if reader.video is not None:  # later images need it
+                    reader(raw)
+                continue
+            item = noted if raw.channel in infos else reader(raw)
+            if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
+                mount = attempt(moving.at, item.stamp)
+                if isinstance(mount, Mount):
+                    yield raw.log_time, "mount", mount
+                else:
+                    item = mount
+            if item is not None:
+                yield raw.log_time, reader.stream, item
+            if (twin := twins.get(raw.channel)) and (other := twin(raw)) is not None:
+                yield raw.log_time, twin.stream, other
 
     def _note_last_before(self, log_time: int, infos: TopicReader) -> None:
         """Add the calibration in force at `log_time`: the last readable one before it."""
