@@ -78,7 +78,8 @@ def _pairs(folder: Path, notes: list[str]) -> list[ImagePair]:
             nanoseconds(row[0], where): folder / camera / "data" / row[1]
             for where, row in read_rows(folder / camera / "data.csv", 2, ",")
         }
-        there = {stamp: path for stamp, path in listed.items() if path.exists()}
+        files = set((folder / camera / "data").glob("*"))  # any name may be listed, also one that no file can have
+        there = {stamp: path for stamp, path in listed.items() if path in files}
         if missing := [path.name for stamp, path in listed.items() if stamp not in there]:
             names = f"{missing[0]}{' and others' if len(missing) > 1 else ''}"
             notes.append(f"{camera}/data.csv lists {counted(len(missing), 'image')} that {camera}/data lacks: {names}")

@@ -46,3 +46,8 @@ def test_a_damaged_file_is_named_in_one_sentence(case, tmp_path, refused):
     *change, sentence = CASES[case]
     assert sentence in refused(*importing(*change, tmp_path))
     assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_listed_image_whose_name_is_too_long_is_missing(tmp_path, said):
+    change = "room/mav0/cam0/data.csv", lambda content: content + b"1700086409000000000," + b"9" * 400
+    assert "lists 2 images that cam0/data lacks" in said(0, *importing("euroc", *change, tmp_path)).out
