@@ -98,7 +98,7 @@ class ResumableWriter(Ros2Writer):
             self._partial.replace(self._before)
             file.close()
             file = self._locked()
-        file.truncate(0)
+        file.seek(file.truncate(0))
         return file
 
     def _locked(self) -> BinaryIO:

@@ -139,6 +139,14 @@ def test_an_import_that_is_killed_again_loses_nothing_of_the_first_one(source, t
     assert {name[0] for name in logged} == {"4", "5"}
 
 
+def test_the_smaller_log_that_a_kill_during_copying_left_is_replaced(source, interrupted):
+    out, content = interrupted.with_name("out.mcap"), interrupted.read_bytes()
+    interrupted.with_suffix(".before").write_bytes(content)
+    interrupted.write_bytes(content[: len(content) // 2])
+    assert roverflow(*importing(source, out)) == 0
+    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+
+
 def test_only_the_images_of_an_import_with_other_options_are_copied(source, interrupted, logged):
     out, fresh = interrupted.with_name("out.mcap"), interrupted.with_name("fresh.mcap")
     assert roverflow(*importing(source, out, pitch_down=20)) == 0
