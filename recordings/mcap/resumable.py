@@ -106,10 +106,8 @@ class ResumableWriter(Ros2Writer):
         file = self._partial.open("ab")
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            free = self._partial.exists() and samestat(
-                self._partial.stat(), os.fstat(file.fileno())
-            )  # not yet finished
-        except BlockingIOError:
+            free = samestat(self._partial.stat(), os.fstat(file.fileno()))
+        except (BlockingIOError, FileNotFoundError):  # another import writes it, or has just finished it
             free = False
         except OSError:  # the file system has no locks
             free = True
