@@ -32,7 +32,7 @@ def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedT
     found.tilt = _kind_set(settings)
     given = settings.inclinometer
     if given is None:
-        _search_tilt(topics, settings, messages, found)
+        _search_tilt(topics, messages, found)
     else:
         topic = next((topic for topic in topics if topic.name == given), None)
         if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
@@ -70,9 +70,7 @@ def _schemas_of(kind: TiltKind, schema: str) -> tuple[str, ...]:
     return () if schema in never else (schema,)
 
 
-def _search_tilt(
-    topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
-) -> None:
+def _search_tilt(topics: Sequence[Topic], messages: DecodedTopics, found: DiscoveredTopics) -> None:
     """Find the inclinometer without a setting of its topic."""
     bare = [topic for topic in topics if topic.schema == BARE_TILT]
     candidates = {

@@ -157,9 +157,8 @@ class SourceResolution:
         if isinstance(pair, LogError):
             self.unavailable |= dict.fromkeys(CAMERAS, str(pair))
             return
-        self.cameras, self.baseline_note = pair, baseline_note(pair, models, names, self.static)
-        if files:
-            self.baseline_note = Finding(f"the calibration is that of {left.topic}")
+        of_file = Finding(f"the calibration is that of {left.topic}")
+        self.cameras, self.baseline_note = pair, of_file if files else baseline_note(pair, models, names, self.static)
 
     def _resolve_tilt(self, kind: TiltKind) -> None:
         """How the tilt is read."""
