@@ -68,7 +68,7 @@ def test_a_report_stands_alone_and_shows_maps_frames_and_losses(result, tmp_path
     assert "# #" not in text
 
 
-def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_path):
+def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_path, monkeypatch):
     path, drawn = tmp_path / "out.mcap", []
     with Ros2Writer(path) as writer:
         writer.metadata("roverflow", {"pipeline": ""})
@@ -86,6 +86,11 @@ def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_pat
         page = relief_page(whole, elevation_limits(whole.layers["elevation"])).pixels
         page = cv2.resize(page, pixels.shape[1::-1], interpolation=cv2.INTER_AREA)
         assert np.abs(page.astype(float) - pixels).mean() < 2
+    monkeypatch.setattr("recordings.reporting.page.MAX_REGIONS", 1)
+    write_report(tmp_path / "out.html", [path])
+    text = (tmp_path / "out.html").read_text()
+    assert Page(text).images == images[:1]
+    assert "1 smaller map in other frames of reference" in text
 
 
 def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):

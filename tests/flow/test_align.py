@@ -242,8 +242,8 @@ def test_nearest_takes_the_nearer_neighbour_within_the_slop():
 
 
 def test_latest_takes_the_last_sample_logged_by_then():
-    messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
-    assert values(sampling(Latest(), *messages)) == [(60, 1.0), (400, 2.0)]
+    messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 90, 0.0, 110), ("at", 400, 0.0)]
+    assert values(sampling(Latest(), *messages)) == [(60, 1.0), (90, 1.0), (400, 2.0)]
 
 
 @given(st.lists(st.integers(0, 1000), min_size=2, unique=True).map(sorted), st.integers(0, 50))

@@ -98,6 +98,7 @@ def test_templates_use_templates(tmp_path):
     assert factors(changed) == {
         "out/begin/first": 0.25, "out/begin": 9.0, "out/end/first": 2.0, "out": 8.0
     }  # fmt: skip
+    assert factors(loaded(tmp_path, NESTED, ["out.template=scaled_twice", "sum.b=out"])) == factors(loaded(tmp_path))
 
 
 def test_optional_applies_to_the_inner_streams(tmp_path):

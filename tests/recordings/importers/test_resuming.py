@@ -5,6 +5,7 @@ import resource
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,9 @@ import yaml
 
 from recordings.importers import recording
 from recordings.importers.files import read_bytes
+from recordings.mcap.file import iter_decoded
 from recordings.mcap.resumable import ResumableWriter
+from recordings.ros2.to_msg import image
 from tests.conftest import roverflow, slow
 from tests.recordings.sample_log import model
 
@@ -145,6 +148,26 @@ def test_the_smaller_log_that_a_kill_during_copying_left_is_replaced(source, int
     interrupted.write_bytes(content[: len(content) // 2])
     assert roverflow(*importing(source, out)) == 0
     assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+
+
+def test_an_import_that_is_stopped_before_it_has_copied_all_loses_nothing(tmp_path):
+    out, stamps = tmp_path / "out.mcap", range(1, 7)
+    noise = np.random.default_rng(0).integers(0, 256, (300, 400), np.uint8)
+
+    def made_until(last):
+        made = []
+        with suppress(KeyboardInterrupt), ResumableWriter(out, "mark") as writer:
+            for stamp in stamps:
+                if stamp > last:
+                    raise KeyboardInterrupt
+                if not writer.skip("/image", stamp):
+                    made.append(stamp)
+                    writer.write("/image", image(stamp, "left", noise), stamp)
+        return made
+
+    assert made_until(0) == [] == list(tmp_path.iterdir())
+    assert [made_until(last) for last in (4, 1, 6)] == [[1, 2, 3, 4], [], [5, 6]]
+    assert [stamp for _, stamp, _ in iter_decoded(out)] == list(stamps)
 
 
 def test_only_the_images_of_an_import_with_other_options_are_copied(source, interrupted, logged):

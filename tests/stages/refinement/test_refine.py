@@ -299,6 +299,7 @@ def test_even_patches_that_are_bright_in_a_colour_are_saturated():
     guide = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     even = cv2.morphologyEx(guide, cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) <= MAX_EVEN_CONTRAST
     np.testing.assert_array_equal(_saturated(image, guide, 250), even & (image >= 250).any(axis=2))
+    assert not _saturated(image.astype(np.uint16), guide, 250).any()
 
 
 def test_a_match_without_correlation_becomes_filled():
