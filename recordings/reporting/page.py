@@ -36,17 +36,23 @@ def write_report(path: Path, results: Sequence[Path]) -> None:
     """
     facts = [read_facts(results[0])]
     facts += [read_facts(result, facts[0].drawn) for result in results[1:]]
-    names = " and ".join(found.path.name for found in facts)
+    names = _names([found.path for found in facts])
     parts = [
         _beside([_verdict(found) for found in facts]),
         _section("What differs", _differences(results)),
         _section("Map", _beside([_regional(found) for found in facts])),
-        _section("Plots", _plots(facts)),
+        _section("Plots", _plots(facts, names)),
         *(_section(name.capitalize(), _beside([_frame(found, name) for found in facts])) for name in facts[0].drawn),
         _section("Losses", _beside([_losses(found) for found in facts])),
         _section("Parameters", _beside([_parameters(found) for found in facts])),
     ]
-    write_page(path, names, parts)
+    write_page(path, " and ".join(names), parts)
+
+
+def _names(results: Sequence[Path]) -> list[str]:
+    """The names of the files, with their folders where two are alike."""
+    names = [result.name for result in results]
+    return names if len(set(names)) == len(names) else [str(result) for result in results]
 
 
 def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
@@ -126,20 +132,19 @@ def _region_pages(maps: MapFiles) -> Iterator[tuple[str, Page]]:
         yield "navigation", verdict_page(verdicts)
 
 
-def _plots(facts: Sequence[RunFacts]) -> str:
+def _plots(facts: Sequence[RunFacts], names: Sequence[str]) -> str:
     """Shares of pixels and cells over time, and the way driven."""
     begin = min((found.stamps[0] for found in facts if found.stamps), default=0)
-    labels = [found.path.name for found in facts]
     plots = []
     for name in dict.fromkeys(name for found in facts for name in found.series):
         series = [found.series.get(name, {}) for found in facts]
         curves = {
             label: [((stamp - begin) / 1e9, value) for stamp, value in sorted(values.items())]
-            for label, values in zip(labels, series, strict=True)
+            for label, values in zip(names, series, strict=True)
         }
         plots.append(line_plot(name, curves))
     for frame_id in dict.fromkeys(frame_id for found in facts for frame_id in found.tracks):
-        tracks = {found.path.name: found.tracks.get(frame_id, []) for found in facts}
+        tracks = {name: found.tracks.get(frame_id, []) for name, found in zip(names, facts, strict=True)}
         plots.append(track_plot(f"way in {frame_id}, x right, y up, m", tracks))
     return f"<div class=pictures>{''.join(plots)}</div>"
 

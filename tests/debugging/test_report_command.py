@@ -104,12 +104,14 @@ def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):
 
 
 def test_two_results_stand_beside_each_other(traverse, result, tmp_path):
-    other, change = tmp_path / "other.mcap", ("--set", "navigation_map.rover.max_step=9 cm")
+    other, change = tmp_path / "other" / result.name, ("--set", "navigation_map.rover.max_step=9 cm")
+    other.parent.mkdir()
     assert roverflow("run", traverse, *SMALL, "-o", other, "--no-rrd", *change) == 0
     assert roverflow("report", result, other) == 0
     page = Page(result.with_suffix(".html").read_text())
     assert "the results first differ at /nav/navigation_map" in " ".join(page.words)
     assert len([name for name, _ in page.images if name == "/nav/navigation_map of the worst frame"]) == 2
+    assert page.words.count(str(result)) == page.words.count(str(other)) == 4  # curves of three plots and the way
 
 
 def test_a_result_beside_another_is_drawn_at_the_same_stamps(result):
