@@ -13,6 +13,7 @@ import pytest
 from distributed import Client
 
 from recordings.simulator import Simulation, write_log
+from tests.conftest import roverflow
 from tests.fleet.test_fleet import PIPELINE, rows_of
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
@@ -71,12 +72,15 @@ def until(words: list[str], beginning: str) -> subprocess.Popen[str]:
 
 
 def ended(home: Path, out: Path, *more: object) -> str:
-    """What a fleet prints that ends with all results."""
+    """What a fleet prints that ends with all results; one is compared with that of a run."""
     done = subprocess.run(command(home, out, *more), env=ENVIRONMENT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert {row["state"] for row in rows_of(out).values()} == {"done"}
     assert sorted(rows_of(out)) == sorted(log.stem for log in home.glob("*.mcap"))
     assert not list(out.glob("*.partial"))
+    plain = out.with_suffix(".mcap")
+    assert roverflow("run", home / "log03.mcap", *PIPELINE, "--no-rrd", "-o", plain) == 0
+    assert (out / "log03-nav.mcap").read_bytes() == plain.read_bytes()
     return done.stdout
 
 
