@@ -74,15 +74,12 @@ class Diff:
         Topic and stamp, ns, at which the results part; of topics that part at one stamp the first in the pipeline.
     topics : dict
         Topic -> `TopicDiff`, in the order of the pipeline.
-    begin : int
-        Log time of the first message of the first result, ns.
     facts : dict
         Fact of the run -> its values in both results, where these differ. The pipelines are a unified diff.
     """
 
     first: tuple[str, int] | None = None
     topics: dict[str, TopicDiff] = field(default_factory=dict)
-    begin: int = 0
     facts: dict[str, tuple[str, str]] = field(default_factory=dict)
 
     @property
@@ -125,10 +122,9 @@ def diff(
         check_profile(path, facts)
     found = Diff(facts=_facts(about[one], about[other]))
     with McapFile(one) as first, McapFile(other) as second:
-        found.begin = first.start
         readers = _Reader(first), _Reader(second)
-        rank = _rank_of(about[one]["pipeline"], {topic for reader in readers for topic in reader.topics.values()})
-        found.topics = {topic: TopicDiff() for topic in sorted(rank, key=lambda topic: rank[topic])}
+        topics = {topic for reader in readers for topic in reader.topics.values()}
+        found.topics = {topic: TopicDiff() for topic in _in_order(topics, about[one]["pipeline"])}
         for change in _changes(*readers, found.topics):
             found.topics[change.topic].add(change)
             on_change(change)
@@ -196,19 +192,19 @@ def _aligned(
             a, b = next(one, None), next(other, None)
 
 
-def _rank_of(pipeline: str, topics: set[str]) -> dict[str, tuple[int, str]]:
-    """Topic -> its place in the pipeline."""
+def _in_order(topics: set[str], pipeline: str) -> list[str]:
+    """The topics in the order of the pipeline's streams."""
     try:
         streams = list(yaml.safe_load(pipeline)["streams"])
     except (yaml.YAMLError, TypeError, KeyError):  # another version of roverflow wrote it
         streams = []
     order = {stream: place for place, stream in enumerate(streams)}
 
-    def rank(topic: str) -> tuple[int, str]:
+    def place(topic: str) -> tuple[int, str]:
         stream = topic.removeprefix("/nav/").partition("/")[0]
         return order.get(stream, len(order)), topic
 
-    return {topic: rank(topic) for topic in topics}
+    return sorted(topics, key=place)
 
 
 def _facts(one: Mapping[str, str], other: Mapping[str, str]) -> dict[str, tuple[str, str]]:
