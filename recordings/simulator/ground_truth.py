@@ -187,4 +187,4 @@ def _clear_lines(scn: Any, eye: Any, points: Any, clear: Any) -> None:
     for k in range(points.shape[0]):
         dx, dy, dz = points[k, 0] - eye[0], points[k, 1] - eye[1], points[k, 2] - eye[2]
         end = 1.0 - SIGHT_TOLERANCE / np.sqrt(dx * dx + dy * dy + dz * dz)
-        clear[k] = raycast.first_hit(scn, eye[0], eye[1], eye[2], dx, dy, dz, 0.0, end)[1] == raycast.SKY
+        clear[k] = raycast.first_hit(scn, eye[0], eye[1], eye[2], dx, dy, dz, end)[1] == raycast.SKY

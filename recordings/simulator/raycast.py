@@ -1,9 +1,8 @@
 """Rays against the simulator's terrain: exact first hits with bilinear ground and with cut ellipsoids.
 
 Rays walk through a pyramid of maxima (Tevs et al. 2008): a ray above the highest point of a block crosses it in one
-step. In the last block the hit is the root of a quadratic, so no step size limits the accuracy. A span of a pixel row
-first walks as one beam, and its rays start where the beam may first hit. All coordinates are world metres; the terrain
-repeats without end.
+step. In the last block the hit is the root of a quadratic, so no step size limits the accuracy. All coordinates are
+world metres; the terrain repeats without end.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from stages.data import Array
 
 # One bucket of rocks spans 2**BUCKET_LEVEL ground cells.
 BUCKET_LEVEL = 1
-SPAN = 16  # px of a row in one beam
 SKY = -2
 GROUND = -1
 ROUNDED = -1
@@ -161,9 +159,9 @@ def _rock_hit(
 @borrowing_kernel
 def _bucket_hit(
     scn: Any, bucket: int, x: float, y: float, px: float, py: float, pz: float, dx: float, dy: float, dz: float,
-    start: float, far: float,
+    far: float,
 ) -> tuple[float, int, int]:  # fmt: skip
-    """Distance, index and facet of the first hit in (start, far) of a rock of the bucket about (x, y); SKY if none."""
+    """Distance, index and facet of the first hit in (0, far) of a rock of the bucket about (x, y); SKY if none."""
     extent = scn.ground.shape[0] * scn.resolution
     tile_x, tile_y, half = extent * floor(x / extent), extent * floor(y / extent), extent / 2
     best, best_rock, best_facet = far, SKY, ROUNDED
@@ -173,14 +171,14 @@ def _bucket_hit(
         cx += extent if cx < x - half else (-extent if cx > x + half else 0.0)
         cy += extent if cy < y - half else (-extent if cy > y + half else 0.0)
         hit, facet = _rock_hit(scn, rock, px - cx, py - cy, pz - scn.rocks[rock, 2], dx, dy, dz)
-        if start < hit < best:
+        if 0.0 < hit < best:
             best, best_rock, best_facet = hit, rock, facet
     return best, best_rock, best_facet
 
 
 @borrowing_kernel
 def first_hit(
-    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, start: float, far: float
+    scn: Any, px: float, py: float, pz: float, dx: float, dy: float, dz: float, far: float
 ) -> tuple[float, int, int]:
     """Distance (in lengths of the direction), surface (GROUND, SKY or a rock's index) and facet of the first hit."""
     n, step = scn.ground.shape[0], scn.resolution
@@ -195,8 +193,8 @@ def first_hit(
     if uy == 0:
         inverse_y = inf
     best, surface, facet = far, SKY, ROUNDED
-    t, level, tested = start, 0, -1
-    ix, iy = floor(gx + ux * t), floor(gy + uy * t)
+    t, level, tested = 0.0, 0, -1
+    ix, iy = floor(gx), floor(gy)
     while t < best:
         if dz >= 0 and pz + dz * t > scn.ceiling:
             break
@@ -214,7 +212,7 @@ def first_hit(
             bucket = ((iy >> BUCKET_LEVEL) & (half - 1)) * half + ((ix >> BUCKET_LEVEL) & (half - 1))
             if bucket != tested and scn.bucket_start[bucket] < scn.bucket_start[bucket + 1]:
                 hit, rock, side = _bucket_hit(
-                    scn, bucket, (ix + 0.5) * step, (iy + 0.5) * step, px, py, pz, dx, dy, dz, start, best
+                    scn, bucket, (ix + 0.5) * step, (iy + 0.5) * step, px, py, pz, dx, dy, dz, best
                 )  # fmt: skip
                 if rock != SKY:
                     best, surface, facet = hit, rock, side
@@ -237,48 +235,6 @@ def first_hit(
     return (best if surface != SKY else inf), surface, facet
 
 
-@borrowing_kernel
-def clear_until(
-    scn: Any, origin: Any, rotation: Any, a: float, b: float, reach: float, far: float
-) -> float:  # fmt: skip
-    """Depth up to which no ray through a span of a row hits anything; `far` if none ever does.
-
-    origin, rotation: as in `cast_rows`; a, b: tangents of the span's middle; reach: of a from there to its ends.
-    """
-    n, step = scn.ground.shape[0], scn.resolution
-    highest = scn.levels.shape[0] - 2
-    px, py, pz = origin[0], origin[1], origin[2]
-    dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
-    dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
-    ex, ey = abs(rotation[0, 0]) * reach, abs(rotation[1, 0]) * reach
-    lowest = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] - abs(rotation[2, 0]) * reach
-    pace = 1 / max(abs(dx), abs(dy), 0.05)
-    t, level = 0.0, 4
-    while t < far:
-        if lowest >= 0 and pz + lowest * t > scn.ceiling:
-            return far
-        size = step * (1 << level)
-        leave = min(t + size * pace, far)
-        x0, x1, y0, y1 = px + dx * t, px + dx * leave, py + dy * t, py + dy * leave
-        i0, i1 = floor((min(y0, y1) - ey * leave) / size), floor((max(y0, y1) + ey * leave) / size)
-        j0, j1 = floor((min(x0, x1) - ex * leave) / size), floor((max(x0, x1) + ex * leave) / size)
-        if i1 - i0 > 3 or j1 - j0 > 3:
-            return t  # the beam is too wide for such small blocks
-        low, width, clear = pz + lowest * (leave if lowest < 0 else t), n >> level, True
-        for i in range(i0, i1 + 1):
-            first = scn.levels[level] + (i & (width - 1)) * width
-            for j in range(j0, j1 + 1):
-                clear = clear and low > scn.tops[first + (j & (width - 1))]
-        if clear:
-            t = leave
-            level = min(level + 1, highest)
-        elif level > 0:
-            level -= 1
-        else:
-            return t
-    return far
-
-
 @typed_kernel
 def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     """The first hit from above at points x, y (N,): elevation (N,) float64, m, and surface (N,) int32.
@@ -287,7 +243,7 @@ def tops_at(scn: Any, x: Any, y: Any, ceiling: float) -> Any:
     """
     z, surface = np.empty(x.shape[0]), np.empty(x.shape[0], np.int32)
     for k in range(x.shape[0]):
-        t, surface[k], _ = first_hit(scn, x[k], y[k], ceiling, 0.0, 0.0, -1.0, 0.0, 1e6)
+        t, surface[k], _ = first_hit(scn, x[k], y[k], ceiling, 0.0, 0.0, -1.0, 1e6)
         z[k] = ceiling - t
     return z, surface
 
@@ -304,16 +260,12 @@ def cast_rows(
     """
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
-        start = 0.0
         for column in range(depth.shape[1]):
-            if column % SPAN == 0:
-                a = (column + (SPAN - 1) / 2 - cx) / fx
-                start = clear_until(scn, origin, rotation, a, b, SPAN / 2 / fx, far)
             a = (column - cx) / fx
             dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2]
             dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2]
             dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2]
-            t, what, side = first_hit(scn, origin[0], origin[1], origin[2], dx, dy, dz, start, far)
+            t, what, side = first_hit(scn, origin[0], origin[1], origin[2], dx, dy, dz, far)
             depth[row, column], surface[row, column], facet[row, column] = t, what, side
 
 
@@ -330,20 +282,14 @@ def seen_rows(
     width = depth.shape[1]
     for row in range(depth.shape[0]):
         b = (first + row - cy) / fy
-        known, clear = -1, 0.0  # of the right camera's row: a span, and how far it is clear
         for column in range(width):
             t = depth[row, column]
             if t == inf:
                 seen[row, column] = 0
                 continue
             seen[row, column] = 128
-            place = column - fx * baseline / t + 0.5
-            if place < 0:
+            if column - fx * baseline / t + 0.5 < 0:
                 continue
-            span, end = int(place) // SPAN, t * (1 - 1e-5) - 1e-5
-            if span != known:
-                a = (span * SPAN + (SPAN - 1) / 2 - cx) / fx
-                known, clear = span, clear_until(scn, right, rotation, a, b, SPAN / 2 / fx, 1e3)
             a = (column - cx) / fx
             # From the right camera, at unit speed along the optical axis, the ray reaches the point at t:
             # an earlier hit hides it.
@@ -351,5 +297,5 @@ def seen_rows(
             dx = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] - (right[0] - left[0]) * nearness
             dy = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] - (right[1] - left[1]) * nearness
             dz = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] - (right[2] - left[2]) * nearness
-            if first_hit(scn, right[0], right[1], right[2], dx, dy, dz, clear, end)[1] == SKY:
+            if first_hit(scn, right[0], right[1], right[2], dx, dy, dz, t * (1 - 1e-5) - 1e-5)[1] == SKY:
                 seen[row, column] = 255

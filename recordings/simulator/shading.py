@@ -105,7 +105,7 @@ def shade_rows(
             if toward > 0:
                 lift = 0.001 + 1e-4 * t
                 x, y, z = x + lift * nx, y + lift * ny, z + lift * nz
-                if first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 0.0, 80.0)[1] == SKY:
+                if first_hit(scn, x, y, z, sun[0], sun[1], sun[2], 80.0)[1] == SKY:
                     # Half Lambert, half Lommel-Seeliger, as dusty surfaces scatter (McEwen 1991).
                     light = SUNLIGHT * grit * (0.5 * toward + toward / (toward + facing))
             light += skylight * (0.5 + 0.5 * nz) * (1 + 0.4 * (grit - 1))

@@ -194,30 +194,10 @@ def test_the_ground_repeats_without_end():
     for _ in range(200):
         x, y = rng.uniform(0, extent, 2)
         direction = (rng.normal(), rng.normal(), rng.uniform(-0.6, -0.02))
-        here = raycast.first_hit(scene, x, y, 3.0, *direction, 0.0, 300.0)
-        there = raycast.first_hit(scene, x + 2 * extent, y - extent, 3.0, *direction, 0.0, 300.0)
+        here = raycast.first_hit(scene, x, y, 3.0, *direction, 300.0)
+        there = raycast.first_hit(scene, x + 2 * extent, y - extent, 3.0, *direction, 300.0)
         assert there[1] == here[1]
         assert there[0] == pytest.approx(here[0], abs=1e-4)
-
-
-def test_no_ray_hits_before_the_clear_depth_of_its_span():
-    scene, camera = SMALL.terrain.scene, SMALL.camera
-    pose = SMALL.base_at(SMALL.begin).after(SMALL.mounts[0])
-    rng, closest = np.random.default_rng(4), []
-    for _ in range(300):
-        a, b = rng.uniform(0, 400) - camera.cx, rng.uniform(40, 300) - camera.cy
-        clear = raycast.clear_until(
-            scene, pose.translation, pose.rotation, a / camera.fx, b / camera.fy, 8 / camera.fx, 300.0
-        )  # fmt: skip
-        hits = []
-        for column in a + np.linspace(-8, 8, 33):
-            direction = pose.rotation @ [column / camera.fx, b / camera.fy, 1.0]
-            hits.append(raycast.first_hit(scene, *pose.translation, *direction, 0.0, 300.0))
-            assert raycast.first_hit(scene, *pose.translation, *direction, clear, 300.0)[1:] == hits[-1][1:]
-        closest.append((clear, min(hit[0] for hit in hits)))
-    clear, hit = np.array(closest).T
-    assert (clear < hit).all()
-    assert np.median(clear[hit < 5] / hit[hit < 5]) > 0.9
 
 
 def test_no_surface_stands_above_the_top_of_its_cell():
