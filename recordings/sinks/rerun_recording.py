@@ -52,6 +52,7 @@ PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers and lines are sent at onc
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
+FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
 
 
 class _Note(NamedTuple):
@@ -147,9 +148,7 @@ class RerunRecording:
         try:
             with catch_and_log_exceptions(strict=True):
                 self._conclude(summary)
-            self._recording.flush()
-            self._recording.disconnect()
-            give_name(self._partial, self._path)
+            self._publish()
         except (OSError, RuntimeError) as error:  # rerun raises RuntimeError if it cannot write its file
             raise unwritable(self._path, getattr(error, "strerror", None) or str(error)) from error
         finally:
@@ -198,6 +197,17 @@ class RerunRecording:
         self._recording.log(LAYOUT, rr.TextDocument(self._layout().as_json()), static=True)
         self._views = -1  # the slowest stages are known now
         self._send_blueprint()
+
+    def _publish(self) -> None:
+        """Finish the file, and name it if its end is there: rerun may not report a full disk."""
+        self._recording.flush()
+        self._recording.disconnect()
+        with self._partial.open("rb") as file:
+            file.seek(max(0, self._partial.stat().st_size - len(FOOTER_MAGIC) - 4))
+            whole = FOOTER_MAGIC in file.read()
+        if not whole:
+            raise OSError("its end is missing, as after a full disk")
+        give_name(self._partial, self._path)
 
     def _set_clocks(self, stamp: int, frame: int) -> None:
         """rerun's timelines belong to the calling thread, so every call from outside sets them first."""

@@ -216,6 +216,23 @@ def test_an_unwritable_path_is_named(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
+    """rerun reports an unexpected full disk only in its log, so the sink checks for it."""
+    monkeypatch.setattr("recordings.sinks.rerun_recording.room_to_grow", lambda file: RESERVED_BYTES)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    sink = opened(tmp_path / "run.rrd")
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        for n in range(3):
+            sink.write(Record(START + n, scene(START + n)))
+        with pytest.raises(LogError, match="cannot write"):
+            sink.close({"verdict": "COMPLETE"})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_recording_ends_before_the_disk_is_full(tmp_path):
     """rerun's writer never returns if the disk is full or the file cannot grow."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
