@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -43,9 +43,6 @@ from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
 from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
 
-if TYPE_CHECKING:
-    from recordings.sinks.rerun_sink import RerunSink
-
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
 PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers and lines are sent at once, without and with a viewer
@@ -65,12 +62,13 @@ class _Note(NamedTuple):
 
 
 class RerunRecording:
-    """A recording that is being written, with its settings.
+    """A recording that is being written.
 
-    streams: name -> type of item, in the pipeline's order; about: facts of the run for its summary.
+    settings: the RerunSink; streams: name -> type of item, in the pipeline's order; about: facts of the run for its
+    summary.
     """
 
-    def __init__(self, settings: RerunSink, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
+    def __init__(self, settings: Any, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         self._settings, self._path, self._streams, self._about = settings, Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
         self._viewer: Follower | None = None

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -20,6 +20,9 @@ from recordings.sinks import DESKS
 from recordings.sinks.overwrite import refuse_foreign
 from recordings.sinks.own_types import NUMBERS, plain_type
 from stages.data import Mount, Region
+
+if TYPE_CHECKING:
+    from recordings.sinks.rerun_recording import RerunRecording
 
 
 @dataclass(eq=False)
@@ -63,7 +66,7 @@ class RerunSink(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._recording: Any = None  # the RerunRecording while it is open
+        self._recording: RerunRecording | None = None  # while it is open
 
     def wants(self, stream: str, kind: Any) -> bool:
         """Whether items of type `kind` can be drawn."""
