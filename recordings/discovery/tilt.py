@@ -44,11 +44,10 @@ def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedT
             found.remedies["inclinometer"] = _meanings(topic.name)
         else:
             found.chosen["inclinometer"], found.why["inclinometer"] = given, "as set"
-            content = (
-                imu_content(messages, given) if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION else None
-            )
-            if content is not None and content.no_orientation and content.accelerations:
-                found.tilt = TiltKind.ACCELERATIONS
+            if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION:
+                content = imu_content(messages, given)
+                if content.no_orientation and content.accelerations:
+                    found.tilt = TiltKind.ACCELERATIONS
     if "inclinometer" in found.chosen and (settings.gyroscope or found.tilt == TiltKind.ACCELERATIONS):
         _find_gyroscope(topics, settings, messages, found)
 

@@ -32,8 +32,8 @@ from recordings.importers.track import Track
 from recordings.ros2.to_msg import raw_imu
 from recordings.source.transforms import rigid
 
-# Relative to mav0. Position, then quaternion w, x, y, z, of the body in a world with z up.
 CAMERAS = ("cam0", "cam1")  # left and right
+# Relative to mav0. Position, then quaternion w, x, y, z, of the body in a world with z up.
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "gt")
 
 
