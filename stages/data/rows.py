@@ -24,7 +24,7 @@ def disparity_rows(disparity: Disparity, first: int, end: int) -> Disparity:
 
 
 def rows_without_sigma(disparity: Disparity) -> range:
-    """The rows that are not refined yet, among refined ones: with a sigma of NaN only. None if all rows are alike."""
+    """The rows of a partly refined disparity image that have no sigma: they are to be refined. Else no row."""
     rows = np.empty(0, int) if disparity.sigma is None else np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
     return range(rows[0], rows[-1] + 1) if 0 < len(rows) < len(disparity.pixels) else range(0)
 

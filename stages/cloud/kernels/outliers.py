@@ -18,8 +18,6 @@ _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1,
 OFFSETS = np.array(
     [(ring * dv, ring * du) for ring in range(1, RINGS + 1) for dv, du in _DIRECTIONS], dtype=np.int32
 )  # fmt: skip
-
-
 MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
 MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the scene's median slope
 MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image

@@ -15,8 +15,6 @@ _FILLED = int(PixelOrigin.FILLED)
 _PLANE = int(PixelOrigin.PLANE)
 _UNKNOWN = int(PixelOrigin.UNKNOWN)
 COLUMN_SPACING = 2  # of columns over that of rows: ground ahead is foreshortened along the columns, not along the rows
-
-
 # Standard deviations of disparities, px. Of a match without its own it rises geometrically from confidence 1 to 0.
 SIGMA_BEST, SIGMA_WORST = 0.086, 42.0
 SIGMA_PLANE, SIGMA_FILLED = 0.75, 3.0  # of the origins PLANE and FILLED
