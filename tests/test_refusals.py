@@ -422,6 +422,7 @@ def test_an_output_needs_the_ending_of_its_kind(traverse, fast_result, tmp_path,
     why = refused("run", traverse, "-o", out)
     assert why.endswith("out.txt is no name of a log; end it in .mcap\n")
     assert refused("simulate", out) == why
+    assert "out.txt is no name of a recording; end it in .rrd" in refused("run", traverse, "--rrd", out)
     assert "out.txt is no name of a report; end it in .html" in refused("report", fast_result, "-o", out)
     why = refused("why", fast_result, "--at", "0", "--cell=2,0", "-o", out)
     assert "out.txt is no name of a picture; end it in .png" in why

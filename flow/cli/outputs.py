@@ -12,7 +12,9 @@ from recordings.atomic_write import check_writable, written
 from recordings.containers.finding import RESULT_ENDING
 from recordings.sinks.overwrite import is_ours
 
-_ENDINGS = {"log": ".mcap", "report": ".html", "picture": ".png"}  # of the names of outputs
+_ENDINGS = {  # of the names of outputs
+    "log": ".mcap", "recording": ".rrd", "difference": ".rrd", "report": ".html", "picture": ".png"
+}  # fmt: skip
 
 
 def add_pipeline_options(sub: argparse.ArgumentParser) -> None:
