@@ -80,10 +80,10 @@ def brief_figures(found: Score) -> list[float]:
 
 
 def brief_row(name: str, values: Sequence[float]) -> tuple[str, ...]:
-    """One row of `SCORES` as text."""
+    """One row of `SCORES` as text; - is unknown."""
     density, half, one, rms, height, *cells = values
-    shares = [f"{100 * value:.2f} %" for value in (density, half, one, *cells)]
-    return (name, *shares[:3], f"{rms:.3f}", f"{100 * height:.2f}", *shares[3:])
+    shares = [_percent(value).replace("%", " %") for value in (density, half, one, *cells)]
+    return (name, *shares[:3], _number(rms, 3), _number(100 * height, 2), *shares[3:])
 
 
 def _frame_lines(found: Score) -> list[str]:

@@ -64,6 +64,15 @@ def test_several_values_of_a_parameter_make_a_table_of_errors(traverse, tmp_path
     )
 
 
+def test_a_variant_whose_maps_do_not_fit_the_truth_says_so(traverse, tmp_path, said):
+    values = [f"--set=resolution={size}" for size in ("10cm", "5cm")]
+    output = said(0, "try", traverse, *AT, "--set=disparities=64", *values, "-o", tmp_path / "try.rrd").out
+    rows = {line.split()[0]: line.split()[-4:] for line in output.splitlines() if re.match(r" +[A-C] +\d", line)}
+    assert rows["B"] == ["-"] * 4
+    assert "-" not in rows["C"]
+    assert "\nB not scored: /nav/elevation_map: its cells are 0.1 m wide, the truth's 0.05 m; " in output
+
+
 def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, said):
     change = ("-p", "fast", "--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
     output = said(0, "try", traverse, "--at", "1.05", "--before", FRAMES, *change).out
@@ -85,7 +94,7 @@ def test_frames_before_the_instant_are_neither_compared_nor_scored(traverse, tmp
 
 
 def test_the_frames_that_were_compared_are_counted(traverse, tmp_path, said):
-    words = ("--at", "1.05", "--frames", 99, "-p", "fast", *SMALL, "-o", tmp_path / "b")
+    words = ("--at", "1.05", "--frames", 99, "-p", "fast", *SMALL, "-o", tmp_path / "b.rrd")
     output = said(0, "try", traverse, *words).out
     assert "2 frames from 1.034 s on: " in output
     assert "\nnote: the log has only 2 frames from there on, not 99\n" in output
@@ -93,7 +102,7 @@ def test_the_frames_that_were_compared_are_counted(traverse, tmp_path, said):
 
 def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_path, said, refused):
     log = rewrite(traverse, tmp_path / "a.mcap", lambda *one: None if one[0] == RIGHT and one[1] == 1 else one[2])
-    words = ("-p", "fast", *SMALL, "-o", tmp_path / "b")
+    words = ("-p", "fast", *SMALL, "-o", tmp_path / "b.rrd")
     output = said(0, "try", log, "--at", "0.5", "--frames", 3, *words).out
     assert "2 frames from 0.534 s on: " in output
     assert "\nnote: 1 frame gave no result; roverflow run --start " in output

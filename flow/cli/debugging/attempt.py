@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -72,8 +73,9 @@ def run(options: argparse.Namespace) -> int:
 
         write([])
         say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
-        if errors := _errors(paths, options.log[0]):
-            say("\n" + "\n".join("  ".join(f"{cell:>12}" for cell in row) for row in errors))
+        errors, unscored = _errors(paths, options.log[0])
+        if errors:
+            say("\n" + "\n".join([*("  ".join(f"{cell:>12}" for cell in row) for row in errors), *unscored]))
             from recordings.comparison.truth import error_pages
 
             recording.errors = [*error_pages(paths, options.log[0])]
@@ -102,19 +104,24 @@ def compared(
     return recording, differences, tables
 
 
-def _errors(paths: dict[str, Path], truth: Path) -> list[list[str]]:
-    """A table of the errors against the truth of the log: a row for each variant; empty without truth."""
+def _errors(paths: dict[str, Path], truth: Path) -> tuple[list[list[str]], list[str]]:
+    """A table of the errors against the truth of the log, a row for each variant, and what is not scored and why.
+
+    Both are empty without truth.
+    """
     from recordings.errors import LogError
     from recordings.scoring.score import score
     from recordings.scoring.table import SCORES, brief_figures, brief_row
 
-    rows = [["", *SCORES[1:]]]
+    rows, unscored = [["", *SCORES[1:]]], list[str]()
     for label, path in paths.items():
         try:
-            rows.append([*brief_row(label, brief_figures(score(path, truth, whole=False)))])
+            found = score(path, truth, whole=False)
         except LogError:  # the log has no truth
-            return []
-    return rows
+            return [], []
+        rows.append([*brief_row(label, brief_figures(found))])
+        unscored += [f"{label} not scored: {topic}: {why}" for topic, whys in found.unscored.items() for why in whys]
+    return rows, unscored
 
 
 def _sweep(
@@ -127,7 +134,7 @@ def _sweep(
         return None
     head, *rows = errors or [[]]
     figures = {
-        _with_unit(name, column[0]): [float(cell.removesuffix(" %")) for cell in column]
+        _with_unit(name, "".join(column)): [math.nan if cell == "-" else float(cell.strip(" %")) for cell in column]
         for name, *column in list(zip(head, *rows, strict=True))[1:]
     }
     counts = {label: changed(found) for label, found in differences.items()}
@@ -139,10 +146,10 @@ def _sweep(
     return Sweep(*setting, figures) if figures else None
 
 
-def _with_unit(name: str, value: str) -> str:
+def _with_unit(name: str, cells: str) -> str:
     """The name of a column with its unit in parentheses."""
     text, _, unit = name.rpartition(" ")
-    return f"{name} (%)" if "%" in value else f"{text} ({unit})"
+    return f"{name} (%)" if "%" in cells else f"{text} ({unit})"
 
 
 def _markdown_rows(rows: list[list[str]]) -> list[str]:

@@ -54,8 +54,7 @@ def score_rows(scores: Mapping[str, Score]) -> list[tuple[str, ...]]:
     """Rows of `SCORES` of logs, and of their mean."""
     figures = {name: brief_figures(found) for name, found in scores.items()}
     figures["mean"] = [_mean(values) for values in zip(*figures.values(), strict=True)]
-    rows = [brief_row(name, values) for name, values in figures.items()]
-    return [tuple("-" if cell.startswith("nan") else cell for cell in row) for row in rows]
+    return [brief_row(name, values) for name, values in figures.items()]
 
 
 def _cell(row: Mapping[str, Any], column: str) -> str:
