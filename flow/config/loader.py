@@ -14,7 +14,7 @@ from typing import Any
 from flow.config.node_spec import NodeSpec, mapping, place_at_fault, type_name
 from flow.config.overrides import Change, with_settings
 from flow.config.templates import SHIPPED, Expansion, Library, Scope, resolved
-from flow.config.yaml_tree import Value, nearest, read
+from flow.config.yaml_tree import Value, nearest, nearest_or_all, read
 from flow.errors import UsageError
 from flow.runtime.graph import (
     Graph,
@@ -192,8 +192,7 @@ def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -
             _check_known(inputs[key], known, value.place)
         elif key not in parameters:
             valid = [*ports, *parameters, "use", "optional"]
-            meant = nearest(key, valid) or f"; it has {', '.join(valid)}"
-            raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{meant}")
+            raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{nearest_or_all(key, valid)}")
     for port in ports:
         if port not in inputs and port not in unneeded:
             raise entry.place.error(f"'{name}' lacks its input '{port}' ({entry.use} needs it)")

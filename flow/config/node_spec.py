@@ -8,7 +8,7 @@ from dataclasses import Field, dataclass, fields, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from flow.config.yaml_tree import Value, nearest
+from flow.config.yaml_tree import Value, nearest, nearest_or_all
 from flow.parameters import coerced, is_required
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
@@ -73,7 +73,7 @@ def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlL
     parameters = {item.name: item for item in fields(kind) if item.init}
     for key, value in given.items():
         if key not in parameters:
-            raise value.key_place.error(f"{name} has no parameter '{key}'{nearest(key, parameters)}")
+            raise value.key_place.error(f"{name} has no parameter '{key}'{nearest_or_all(key, [*parameters])}")
         inner = dataclass_of(hints[key])
         if inner is not None and isinstance(value.value, dict):
             values[key] = _constructed(inner, f"{name}.{key}", value.value, value.place)

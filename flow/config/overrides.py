@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from flow.config.node_spec import mapping
-from flow.config.yaml_tree import Value, nearest, read
+from flow.config.yaml_tree import Value, nearest, nearest_or_all, read
 from flow.errors import UsageError
 from flow.runtime.graph import YamlLocation
 
@@ -102,7 +102,7 @@ def _unknown(change: Change, entries: Iterable[str], settings: Mapping[str, Valu
         return f"there is no stream '{target}'{nearest(target, [*entries, *settings])}"
     if target in entries:
         return f"name the parameter of '{target}', as in {target}.parameter=value{nearest(target, settings)}"
-    return f"the pipeline has no setting '{target}'{nearest(target, settings)}"
+    return f"the pipeline has no setting '{target}'{nearest_or_all(target, [*settings])}"
 
 
 def _part(tree: Value, key: str, kind: type) -> Any:

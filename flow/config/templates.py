@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flow.config.node_spec import NodeSpec, mapping
 from flow.config.overrides import Change, filled_in
-from flow.config.yaml_tree import Value, nearest, read
+from flow.config.yaml_tree import Value, nearest, nearest_or_all, read
 from flow.runtime.graph import TemplateUse, YamlLocation, ports_of
 
 SHIPPED = Path(__file__).parent.parent / "pipelines"
@@ -190,7 +190,7 @@ class Expansion:
         for key, value in given.items():
             if key not in template.inputs and key not in template.parameters:
                 valid = [*template.inputs, *template.parameters, "optional"]
-                meant = nearest(key, valid) or f"; it has {', '.join(valid)}"
+                meant = nearest_or_all(key, valid)
                 raise value.key_place.error(f"template '{template.name}' has no input or parameter '{key}'{meant}")
         if scope is None:
             own = {key: item.plain() for key, item in template.parameters.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -52,6 +52,11 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of a sentence about an invalid `name`: the valid name nearest to it, if one is near."""
     close = get_close_matches(name, list(valid), n=1)
     return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def nearest_or_all(name: str, valid: Sequence[str]) -> str:
+    """As `nearest`, or where none is near, all valid names."""
+    return nearest(name, valid) or (f"; it has {', '.join(valid)}" if valid else "")
 
 
 def read(text: str, at: Callable[[int], YamlLocation]) -> Value:
