@@ -88,6 +88,8 @@ def read_scene(folder: Path | str, stamp: int = FIRST_STAMP) -> MiddleburyScene:
     """The scene of a folder, with its frame at `stamp`, ns. Raises LogError if a file is missing (the truth may be) or
     cannot be used."""
     folder = Path(folder)
+    if not (folder / CALIBRATION).is_file():
+        raise LogError(f"{folder} has no {CALIBRATION}; give the folder of one scene")
     text, numbers = _calibration(folder / CALIBRATION)
     ndisp = int(numbers.pop("ndisp"))
     left, right = (folder / name for name in IMAGES)
