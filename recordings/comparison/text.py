@@ -48,7 +48,8 @@ def markdown(found: Diff) -> str:
 
 def _line(item: TopicDiff) -> str:
     alone = [f"{number} only in {name}" for name, number in (("A", item.only_one), ("B", item.only_other)) if number]
-    parts = [", ".join([f"{item.differing} of {item.messages} messages differ", *alone])]
+    both = [f"{item.differing} of {item.messages} messages differ"] if item.messages else []
+    parts = [", ".join([*both, *alone])]
     layers = [name for name in item.worst if name.startswith(_LAYER)]
     sizes = [name for name in item.worst if name.startswith(("median ", "largest "))]
     counts = [name for name in item.worst if name not in (*layers[1:], *sizes)]
