@@ -132,7 +132,7 @@ class Rectify(Stage):
             return replace(self, row_offset=0.0), Finding(swapped, Severity.FAULT, about="cameras")
         terms = tuple(round(term, 4) for term in offset.terms)
         found = (
-            f"rows of left and right differ by {terms[0]:+.2f} px at the centre, at most {offset.largest:.2f} px "
+            f"rows of left and right differ by {terms[0]:+z.2f} px at the centre, at most {offset.largest:.2f} px "
             f"(sigma {offset.error:.2f}, {offset.features} features of {counted(len(plain), 'frame')})"
         )
         if not offset.clear:

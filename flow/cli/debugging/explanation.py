@@ -184,7 +184,7 @@ def why(
     x, y = cell if cell is not None else _place(cloud, pixel)
     place = index_of(navigation, x, y)
     if place is None:
-        raise UsageError(f"({x:g}, {y:g}) is outside the map, which has {_extent(navigation)}")
+        raise UsageError(f"({x:.5g}, {y:.5g}) is outside the map, which has {_extent(navigation)}")
     x, y = centre_of(navigation, place)
     cells = np.floor((cloud.points[:, :2] - np.array(navigation.origin)) / navigation.resolution)
     inside = (cells == place[::-1]).all(axis=1)

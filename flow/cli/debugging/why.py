@@ -87,7 +87,8 @@ def _regional(options: argparse.Namespace) -> int:
     kept = f"of the clouds that the log keeps{thinned}"
     lines.append(f"frames with points in the cell ({kept}): {len(found.frames)}{more}")
     lines += [
-        f"  {moment(frame.stamp)}  {frame.points:4} points, height {frame.height:.3f} m" for frame in found.frames
+        f"  {moment(frame.stamp)}  {counted(frame.points, 'point'):>11}, height {frame.height:.3f} m"
+        for frame in found.frames
     ]
     say("\n".join(lines))
     return COMPLETE
