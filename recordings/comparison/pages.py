@@ -32,13 +32,13 @@ FLIPS = {
 
 
 def pages(schema: str, one: Any, other: Any) -> tuple[Page, Page, Page] | None:
-    """A, B, and B less A as pages with one extent and one scale; None for a type without pages.
+    """A, B, and B less A as pages with one extent and one scale; None for two sizes, or a map without elevations.
 
-    schema: full ROS 2 name of the type of the decoded messages.
+    schema: full ROS 2 name, in `PAGES`, of the type of the decoded messages.
     """
-    if schema not in _PAGES or (schema == _GRID_MAP and "elevation" not in read_layers(one)):
+    if schema == _GRID_MAP and "elevation" not in read_layers(one):
         return None
-    return _PAGES[schema](one, other)
+    return PAGES[schema](one, other)
 
 
 def error_page(estimate: Array, truth: Array) -> bytes | None:
@@ -104,7 +104,7 @@ def _map(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Page:
     return map_page(extended, grid.resolution, corner, f"{title} ({grid.frame_id})")
 
 
-_PAGES: Mapping[str, Callable[[Any, Any], tuple[Page, Page, Page] | None]] = {
+PAGES: Mapping[str, Callable[[Any, Any], tuple[Page, Page, Page] | None]] = {
     "stereo_msgs/msg/DisparityImage": _disparities,
     _GRID_MAP: _elevations,
     "nav_msgs/msg/OccupancyGrid": _verdicts,

@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from recordings.atomic_write import written
 from recordings.comparison.diff import MessageDifference
-from recordings.comparison.pages import pages
+from recordings.comparison.pages import PAGES, pages
 from recordings.comparison.sweep import Sweep
 from recordings.png import png
 from recordings.ros2.cdr import full_name
@@ -55,7 +55,7 @@ class DiffRecording:
         return partial(self._add, prefix)
 
     def _add(self, prefix: str, change: MessageDifference) -> None:
-        if change.one is None or change.other is None:
+        if change.one is None or change.other is None or full_name(change.one.__msgtype__) not in PAGES:
             return
         if change.stamp not in self.stamps:
             if len(self.stamps) == MAX_FRAMES:
@@ -118,6 +118,6 @@ def _beside(path: str, variant: str) -> rrb.Container:
 
 
 def _drawn(change: MessageDifference) -> tuple[bytes, ...]:
-    """The pages of a difference as PNG files; none for a type without pages."""
+    """The pages of a difference as PNG files; none for two sizes, or a map without elevations."""
     found = pages(full_name(change.one.__msgtype__), change.one, change.other)
     return () if found is None else tuple(png(page.pixels) for page in found)
