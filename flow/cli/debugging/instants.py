@@ -89,7 +89,7 @@ def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:
     """The sentence that an instant is outside the images of a log. times: their log times, ns."""
     if isinstance(at, float | int):
         first, last = ((int(time) - log.begin) / 1e9 for time in times[[0, -1]])
-        return f"--at {at:g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s"
+        return f"--at {at:.12g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s"
     given, *ends = map(_shown, (_ns(log, at), _stamp(log, times, 0), _stamp(log, times, -1)))
     return f"--at {given} is outside the images of the log, which lie from {ends[0]} to {ends[1]}"
 
