@@ -84,9 +84,9 @@ def test_every_remedy_that_info_lists_leads_to_a_log_that_a_run_accepts(fault, t
     assert refused == [line for line in offered if any(words in line for words in untrue)]
 
 
-def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_path, refused):
+def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_path, said, refused):
     log, written = write_sample(tmp_path / "log.mcap"), tmp_path / "mine.yaml"
-    assert roverflow("info", log, "--write-pipeline", written) == 0
+    assert said(0, "info", log, "--write-pipeline", written).out.endswith(f"\nwrote {written}\n")
     source = yaml.safe_load(written.read_text())["source"]
     assert (source["left"], source["right"], source["inclinometer"]) == (LEFT, RIGHT, TILT)
     assert roverflow("info", log, "-p", written) == 0

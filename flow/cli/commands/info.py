@@ -49,6 +49,8 @@ def run(options: argparse.Namespace) -> int:
     else:
         say(format_description(description))
         say("\n".join(_verdict(options, description, graph)))
+        if options.write_pipeline is not None:
+            say(f"wrote {options.write_pipeline}")
     if description["refused"] and not description["result"]:
         return UNUSABLE
     return INCOMPLETE if description["damage"] else COMPLETE
