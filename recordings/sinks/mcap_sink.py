@@ -97,7 +97,8 @@ class McapSink:
     )
 
     profile: str = parameter(
-        "ros2", "messages of the log; Foxglove draws its own without extensions, but score and export read only ros2",
+        "ros2",
+        "messages of the log; Foxglove draws its own without extensions; score, export, diff and report read only ros2",
         choices=("ros2", "foxglove"),
     )  # fmt: skip
 
