@@ -12,6 +12,7 @@ from flow.contracts import Severity
 from recordings import McapSource
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
+from recordings.inventory.description import Damage
 from recordings.inventory.text import format_description
 from recordings.mcap.chunk import HEAD_BYTES
 from recordings.mcap.file import McapFile
@@ -104,6 +105,13 @@ def test_without_cameras_no_pairs_are_reported(tmp_path):
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", dropped(*INFOS))))
     assert "missing: left: no CameraInfo belongs to" in text
     assert "frames:" not in text
+
+
+def test_only_sentences_about_single_messages_are_counted_together():
+    damage = Damage()
+    for sentence in ("/a at 5 ns: cut at 1", "byte 5 is broken", "/a at 7 ns: cut at 2", *["byte 9 is broken"] * 2):
+        damage.add(sentence)
+    assert damage.listed() == ["2 similar, first: /a at 5 ns: cut at 1", "byte 5 is broken", "byte 9 is broken"]
 
 
 def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path):
