@@ -18,6 +18,7 @@ from recordings.comparison.sweep import Sweep
 from recordings.png import png
 from recordings.ros2.cdr import full_name
 from recordings.sinks.blueprint import CLOCK, FRAME
+from recordings.sinks.rerun_recording import check_room
 
 MAX_FRAMES = 50  # stamps that are drawn
 MAX_WAITING = 4  # messages that wait for a thread that draws them
@@ -70,6 +71,7 @@ class DiffRecording:
         """Write the recording. tables: Markdown that is shown beside the pictures. Raises UnwritableError."""
         pictures = self.pictures
         with written(path) as temporary:
+            check_room(temporary, path)
             stream = rr.RecordingStream("roverflow_diff")
             stream.set_log_time_enabled(False)
             stream.set_sinks(rr.FileSink(str(temporary)))
@@ -80,6 +82,7 @@ class DiffRecording:
             for topic, stamp, sides in pictures:
                 stream.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
                 stream.set_time(FRAME, sequence=self.stamps.index(stamp))
+                check_room(temporary, path)
                 for side, picture in zip(_SIDES, sides, strict=True):
                     stream.log(f"{topic}/{side}", rr.EncodedImage(contents=picture, media_type="image/png"))
             for variant, stamp, picture in self.errors:

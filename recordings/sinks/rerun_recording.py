@@ -52,6 +52,15 @@ STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
 FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
 
 
+def check_room(partial: Path, path: Path) -> None:
+    """Raise UnwritableError before the disk is full: rerun's writer never returns from a full one.
+
+    partial: the file that grows; path: the name it will get.
+    """
+    if room_to_grow(partial) < RESERVED_BYTES:
+        raise unwritable(path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
+
+
 class _Note(NamedTuple):
     """Numbers of a frame by their paths, and its text in the ledger."""
 
@@ -101,13 +110,8 @@ class RerunRecording:
         self._interval, self._rest = settings.every, 1e6 * settings.max_megabytes
         self._drawn = 0  # frames with images
 
-    def _check_room(self) -> None:
-        """Raise LogError before the disk is full: rerun's writer never returns from a full one."""
-        if room_to_grow(self._partial) < RESERVED_BYTES:
-            raise unwritable(self._path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
-
     def _begin(self) -> None:
-        self._check_room()
+        check_room(self._partial, self._path)
         batches = rr.ChunkBatcherConfig(flush_tick=BATCH_SECONDS, flush_num_bytes=BATCH_BYTES)
         self._recording = rr.RecordingStream(APPLICATION, batcher_config=batches)
         self._recording.set_log_time_enabled(False)
@@ -122,7 +126,7 @@ class RerunRecording:
 
     def write(self, record: FrameRecord) -> None:
         """Draw one frame."""
-        self._check_room()
+        check_room(self._partial, self._path)
         with catch_and_log_exceptions(strict=True):
             self._set_clocks(record.stamp, self._frames)
             self._canvas.rows.stamp, self._canvas.rows.frame = record.stamp, self._frames

@@ -110,6 +110,14 @@ def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_p
     assert "no frame went through at 1.034 s: left unmatched; roverflow run --start " in why
 
 
+def test_a_comparison_ends_before_the_disk_is_full(traverse, tmp_path, said, monkeypatch):
+    """rerun's writer never returns from a full disk."""
+    monkeypatch.setattr("recordings.sinks.rerun_recording.RESERVED_BYTES", 1 << 62)
+    out = tmp_path / "try.rrd"
+    assert f"cannot write {out}: less than" in said(1, "try", traverse, *AT, *SMALL, "-o", out).err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, said):
     out = tmp_path / "try.rrd"
     output = said(0, "try", traverse, *AT, "--set", "navigation_map.rover.max_step=20 cm", "-o", out).out
