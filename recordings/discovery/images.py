@@ -58,7 +58,7 @@ def find_images(topics: Sequence[Topic], settings: LogSettings, found: Discovere
         unread = f": no message of {silent} can be read" if silent else ""
         why = {
             0: f"the log has no camera images (sensor_msgs/Image or CompressedImage){unread}; give a log with images",
-            1: f"the log has only one image topic ({listed}), but stereo needs two{unread}",
+            1: f"the log has only one image topic ({listed}), but stereo needs two{unread}; record both cameras",
         }.get(len(candidates), f"no two image topics have names of a left and a right camera ({listed})")
         remedy = "; set 'left' and 'right' of the source to the topics" if len(candidates) > 1 else ""
         found.missing.update(left=why + remedy, right=why + remedy)

@@ -89,7 +89,7 @@ class Merged:
                 )
         paired = {number for pair in self.overlaps for number in pair}
         for number, log in enumerate(self.logs, 1):
-            if number not in paired:
+            if number not in paired and len(self.logs) > 1:
                 yield False, f"{log.name} has no cell in common with another log"
 
     def as_json(self) -> dict[str, Any]:
