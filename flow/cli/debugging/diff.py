@@ -16,8 +16,8 @@ HELP = "compare two result logs: the first difference, and how large the differe
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("one", type=Path, metavar="A.mcap")
-    sub.add_argument("other", type=Path, metavar="B.mcap")
+    sub.add_argument("one", type=Path, metavar="A.mcap", help="result log")
+    sub.add_argument("other", type=Path, metavar="B.mcap", help="result log to compare with it")
     sub.add_argument("-o", "--out", type=Path, metavar="DIFF.rrd", help="write a rerun recording of the differences")
     sub.add_argument("--json", action="store_true", help="print JSON")
 

@@ -33,7 +33,7 @@ class DataSet:
 
     def add_arguments(self, sub: argparse.ArgumentParser) -> None:
         sub.add_argument("source", type=Path, metavar="SOURCE", help=self.source)
-        sub.add_argument("out", type=Path, metavar="OUT.mcap")
+        sub.add_argument("out", type=Path, metavar="OUT.mcap", help="log to write")
         sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"what the files do not say: {self.rig}")
         for name, option in self.options.items():
             sub.add_argument(f"--{name}", **option)

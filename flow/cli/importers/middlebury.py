@@ -14,7 +14,7 @@ HELP = "a Middlebury scene with ground truth (camera pose unknown: assumes level
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of a scene")
-    sub.add_argument("out", type=Path, metavar="OUT.mcap")
+    sub.add_argument("out", type=Path, metavar="OUT.mcap", help="log to write")
 
 
 def run(options: argparse.Namespace) -> int:
