@@ -67,11 +67,9 @@ def by_cause(drops: Mapping[str, int]) -> list[tuple[str, int]]:
     return [(str(reason), drops[reason]) for reason in LossReason if reason in drops]
 
 
-def report(summary: dict[str, Any]) -> None:
-    """Print the summary of a run."""
-    from stages.kernel_loading import compiled_now
-
-    say(headline(summary) + (" (with compiling kernels)" if compiled_now() else ""))
+def report(summary: dict[str, Any], compiled: bool = False) -> None:
+    """Print the summary of a run. compiled: whether it compiled kernels, which lowers its rate."""
+    say(headline(summary) + (" (with compiling kernels)" if compiled else ""))
     if summary["frames_left_out"]:
         say(f"  {counted(summary['frames_left_out'], 'frame')} left out by --every {summary['every']}")
     found = [summary["surveys"], summary["findings"]]

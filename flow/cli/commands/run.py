@@ -77,6 +77,8 @@ def run(options: argparse.Namespace) -> int:
         with suppress(UnwritableError):  # the failed sink is the error to report
             write_text(options.summary, json.dumps(as_json(error.summary), indent=2))
         raise
-    report(summary)
+    from stages.kernel_loading import compiled_now
+
+    report(summary, compiled_now())
     write_text(options.summary, json.dumps(summary, indent=2))
     return exit_code(summary)
