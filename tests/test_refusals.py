@@ -19,7 +19,7 @@ from tests.conftest import SMALL, rewrite, roverflow
 from tests.recordings.importers.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
-SET = "--set STREAM.PARAM=VALUE changes the pipeline"
+OPTIONS = "--help lists the options, and --set STREAM.PARAM=VALUE changes the pipeline"
 TAKEN = "exists and is no {} of roverflow; choose another name or remove it"
 
 
@@ -397,8 +397,10 @@ def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
         ("rnu a.mcap", "roverflow", "there is no command 'rnu'; did you mean 'run'?"),
         ("import kiti a", "roverflow", "there is no kind of import 'kiti'; did you mean 'kitti'?"),
         ("export a.mcap b --mpa x", "roverflow export", "unknown: --mpa x; did you mean '--map'?"),
-        ("run a b --dis 64", "roverflow run", f"unknown: --dis 64; {SET}"),
-        ("try a --at 0 --set b.c=1 --disparities", "roverflow try", f"unknown: --disparities; {SET}"),
+        ("run a b --recording x", "roverflow run", f"unknown: --recording x; roverflow run {OPTIONS}"),
+        ("run a b --ever 2 --sumary s.json", "roverflow run", "unknown: --sumary s.json; did you mean '--summary'?"),
+        ("try a --at 0 --set b.c=1 --dis", "roverflow try", f"unknown: --dis; roverflow try {OPTIONS}"),
+        ("score a.mcap -x", "roverflow score", "unknown: -x; roverflow score --help lists the options"),
     ],
 )
 def test_an_unknown_name_is_answered_with_the_usage_and_the_nearest(command, usage, words, capsys):

@@ -75,17 +75,18 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace:
     options, unknown = top.parse_known_args(_joined(given) or ["--help"])
     if unknown:
         valid = [option for action in options.parser._actions for option in action.option_strings]
-        remedy = "; --set STREAM.PARAM=VALUE changes the pipeline" if "--set" in valid else ""
-        _refuse(options.parser, f"unknown: {' '.join(unknown)}{remedy}", unknown[0], valid)
+        pipeline = ", and --set STREAM.PARAM=VALUE changes the pipeline" if "--set" in valid else ""
+        remedy = f"; {options.parser.prog} --help lists the options{pipeline}"
+        _refuse(options.parser, f"unknown: {' '.join(unknown)}", unknown[0], valid, remedy)
     return options
 
 
-def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequence[str]) -> NoReturn:
-    """End the program with the usage of a command and the valid name nearest to `name`."""
+def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequence[str], remedy: str = "") -> NoReturn:
+    """End the program with the usage of a command and the valid name nearest to `name`, or else the remedy."""
     from flow.config.yaml_tree import nearest
 
     near = [each for each in valid if nearest(name.lstrip("-"), [each.lstrip("-")])]  # all options share the dashes
-    parser.error(f"{why}{nearest(name, near)}")
+    parser.error(f"{why}{nearest(name, near) or remedy}")
 
 
 def _named(given: Sequence[str]) -> Iterator[tuple[str, str, Sequence[str]]]:

@@ -13,6 +13,7 @@ import yaml
 from flow.runtime.graph import YamlLocation
 
 MAX_VALUES = 100_000  # of a pipeline file
+MIN_ALIKE = 2 / 3  # of the letters of two names that are near; 'rnu' and 'run' share as many
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class Value:
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of a sentence about an invalid `name`: the valid name nearest to it, if one is near."""
-    close = get_close_matches(name, list(valid), n=1)
+    close = get_close_matches(name, list(valid), n=1, cutoff=MIN_ALIKE)
     return f"; did you mean '{close[0]}'?" if close else ""
 
 
