@@ -169,7 +169,8 @@ class Sink(Protocol):
 
     Optional members:
 
-    - `names_streams`: the parameters that name streams, so that a pipeline file can be checked;
+    - `names_streams`, `names_patterns`: the parameters that name streams, and those that name them by patterns such as
+      disparity/*, so that a pipeline file can be checked;
     - `unwritable(stream, kind)`: why the sink cannot write a stream, or an empty str; asked when a pipeline is loaded;
     - `prepare(stream, item)`: what `write` gets in place of an item, such as its encoded bytes. Any thread calls it as
       soon as the item is there, frames in any order, so it must not depend on other calls. The engine does not keep the

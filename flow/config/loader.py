@@ -6,6 +6,7 @@ the dataclasses and annotations of the stages. An error names the file, the line
 
 from __future__ import annotations
 
+import fnmatch
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -251,6 +252,11 @@ def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
                 raise entry.place_of(key).error(
                     f"'{name}' does not run on the clock of the frames, '{graph.clock}'; align it first (flow.align)"
                 )
+    for key in set(getattr(sink, "names_patterns", ())) & entry.given().keys():
+        for pattern in entry.item.value[key].plain():
+            if not fnmatch.filter(graph.frame_streams, pattern):
+                near = nearest(pattern, graph.frame_streams)
+                raise entry.place_of(key).error(f"no stream of the frames matches '{pattern}'{near}")
     for name, kind in graph.frame_streams.items() if hasattr(sink, "unwritable") else ():
         if why := sink.unwritable(name, kind):
             named = [key for key in keys if name in entry.item.value[key].plain()]

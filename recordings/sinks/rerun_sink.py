@@ -62,6 +62,7 @@ class RerunSink(Checked):
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     suffix = ".rrd"
+    names_patterns: ClassVar[tuple[str, ...]] = ("without",)
     asks: ClassVar = {"keep_costs": True}  # of matchers
 
     def __post_init__(self) -> None:

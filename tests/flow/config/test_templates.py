@@ -219,6 +219,8 @@ def test_one_rover_reaches_every_stage_that_needs_it(name):
         ("McapSink.compression=zip", "recordings.McapSink.compression: must be one of lz4, zstd, none, not zip"),
         ("McapSnk.compression=zstd", "there is no stream 'McapSnk'; did you mean 'McapSink'?"),
         ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
+        ("RerunSink.without=[cloud, clowd]", "no stream of the frames matches 'clowd'; did you mean 'cloud'?"),
+        ("RerunSink.without=[terrain/*]", "no stream of the frames matches 'terrain/*'"),
     ],
 )
 def test_a_mistake_in_the_rover_or_a_sink_names_the_setting(override, message):
