@@ -46,6 +46,16 @@ def parameter(
     return field(default=default, metadata=about)
 
 
+def set_by_run(default: Any) -> Any:
+    """A dataclass field of a sink that a run sets; a pipeline file cannot."""
+    return field(default=default, metadata={"set_by_run": True})
+
+
+def parameters_of(kind: type) -> dict[str, Field[Any]]:
+    """The parameters of a dataclass that a pipeline file can set."""
+    return {known.name: known for known in fields(kind) if known.init and "set_by_run" not in known.metadata}
+
+
 def check_parameters(item: Any) -> None:
     """Raise ValueError for the first parameter of a dataclass object that is out of its range or not of its type."""
     for known in fields(item):

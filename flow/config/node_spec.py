@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import Field, dataclass, fields, is_dataclass
+from dataclasses import Field, dataclass, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
 from flow.config.yaml_tree import Value, nearest, nearest_or_all
-from flow.parameters import coerced, is_required
+from flow.parameters import coerced, is_required, parameters_of
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
 
@@ -56,7 +56,7 @@ class NodeSpec:
 
     def parameters(self) -> dict[str, Field[Any]]:
         """The parameters of its class."""
-        return {item.name: item for item in fields(self.kind) if item.init}
+        return parameters_of(self.kind)
 
     def made(self, inputs: Collection[str] = ()) -> Any:
         """The object that the entry describes; inputs: keys that are no parameters."""
@@ -69,8 +69,7 @@ class NodeSpec:
 def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlLocation) -> Any:
     """An object of a dataclass with the given parameters; name: its name in messages. Raises TypeError for annotations
     that cannot be read."""
-    hints, values = hints_of(kind), {}
-    parameters = {item.name: item for item in fields(kind) if item.init}
+    hints, values, parameters = hints_of(kind), {}, parameters_of(kind)
     for key, value in given.items():
         if key not in parameters:
             raise value.key_place.error(f"{name} has no parameter '{key}'{nearest_or_all(key, [*parameters])}")
@@ -78,7 +77,7 @@ def _constructed(kind: type, name: str, given: Mapping[str, Value], place: YamlL
         if inner is not None and isinstance(value.value, dict):
             values[key] = _constructed(inner, f"{name}.{key}", value.value, value.place)
         elif inner is not None and value.value is not None:
-            names = ", ".join(item.name for item in fields(inner) if item.init)
+            names = ", ".join(parameters_of(inner))
             raise value.place.error(f"{name}.{key}: expected a mapping of {names}, not {value.plain()!r}")
         else:
             try:

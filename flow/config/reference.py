@@ -6,7 +6,7 @@ import inspect
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import Field, dataclass, fields, is_dataclass
+from dataclasses import Field, dataclass, is_dataclass
 from enum import IntEnum
 from importlib import import_module
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 from flow.config.node_spec import ROLES, class_at, dataclass_of, lacking, type_name
 from flow.config.yaml_tree import nearest
 from flow.errors import UsageError
-from flow.parameters import is_required
+from flow.parameters import is_required, parameters_of
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner, ports_of
 from flow.units import as_written
 
@@ -96,7 +96,7 @@ def _usable(module_name: str) -> Iterator[tuple[str, type]]:
 
 def _is_documented(kind: type) -> bool:
     """Whether its fields are parameters: those of a data type are not."""
-    return all("help" in known.metadata for known in fields(kind) if known.init)
+    return all("help" in known.metadata for known in parameters_of(kind).values())
 
 
 def _role(kind: type) -> str:
@@ -137,7 +137,7 @@ def _documented_fields(doc: str) -> dict[str, str]:
 def _parameters(kind: type, prefix: str = "") -> Iterator[ParameterReference]:
     """The parameters of a class, those of a dataclass among them one by one."""
     hints = hints_of(kind)
-    for known in (item for item in fields(kind) if item.init):
+    for known in parameters_of(kind).values():
         inner = dataclass_of(hints[known.name])
         if inner is not None:
             yield from _parameters(inner, f"{prefix}{known.name}.")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from flow.contracts import FrameRecord, Loss
-from flow.parameters import check_parameters, parameter
+from flow.parameters import check_parameters, parameter, set_by_run
 from recordings.errors import LogError
 from recordings.mcap.input_copy import copy_inputs, parents_in
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
@@ -102,7 +102,7 @@ class McapSink:
         choices=("ros2", "foxglove"),
     )  # fmt: skip
 
-    inputs: tuple[str, ...] = parameter((), "logs that are copied beside the results; `run --with-inputs` sets them")
+    inputs: tuple[str, ...] = set_by_run(())  # logs that are copied beside the results
 
     suffix = ".mcap"
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")

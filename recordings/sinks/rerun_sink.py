@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from flow.contracts import FrameRecord
-from flow.parameters import Checked, parameter
+from flow.parameters import Checked, parameter, set_by_run
 from recordings.errors import LogError
 from recordings.sinks import DESKS
 from recordings.sinks.overwrite import refuse_foreign
@@ -51,15 +51,11 @@ class RerunSink(Checked):
         "often each time that half of the remaining room is used",
         low=0, unit="MB",
     )  # fmt: skip
-    live_pipe: int = parameter(
-        0, "file descriptor of a pipe to a viewer, which gets the recording while it is written; 0: none", low=0
-    )
     without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
-    limits: tuple[str, ...] = parameter(
-        (),
-        "limits of layers, as elevation_map/step=0.17, which their scales show; `run` sets those of the hazard rule",
-    )
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
+
+    live_pipe: int = set_by_run(0)  # file descriptor to a viewer, which gets the recording as it is written; 0: none
+    limits: tuple[str, ...] = set_by_run(())  # of layers, as elevation_map/step=0.17, which their scales show
 
     suffix = ".rrd"
     names_patterns: ClassVar[tuple[str, ...]] = ("without",)

@@ -221,6 +221,9 @@ def test_one_rover_reaches_every_stage_that_needs_it(name):
         ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
         ("RerunSink.without=[cloud, clowd]", "no stream of the frames matches 'clowd'; did you mean 'cloud'?"),
         ("RerunSink.without=[terrain/*]", "no stream of the frames matches 'terrain/*'"),
+        ("RerunSink.live_pipe=3", "recordings.RerunSink has no parameter 'live_pipe'; it has max_width, jpeg_quality"),
+        ("RerunSink.limits=[a=1]", "recordings.RerunSink has no parameter 'limits'; it has max_width, jpeg_quality"),
+        ("McapSink.inputs=[a.mcap]", "recordings.McapSink has no parameter 'inputs'; it has results, also"),
     ],
 )
 def test_a_mistake_in_the_rover_or_a_sink_names_the_setting(override, message):
