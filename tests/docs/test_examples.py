@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from flow.contracts import Severity
+from flow.contracts import Severity, StageError
 from recordings.simulator import Simulation
-from stages import ElevationMap, NavigationMap
+from stages import Disparity, ElevationMap, NavigationMap, PixelOrigin, known
 from tests.docs import pages
 
 
@@ -38,13 +38,25 @@ def written(tmp_path, monkeypatch):
     return write
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/writing-a-stage.md"])
-def test_the_stage_of_the_page_removes_sparse_cells(page, written):
-    stage = written(page, "my_module").DropSparse(min_points=5)
+def test_the_stage_of_the_readme_removes_sparse_cells(written):
+    stage = written("README.md", "my_module").DropSparse(min_points=5)
     layers = {"elevation": np.ones((1, 2), np.float32), "count": np.array([[4, 5]], np.float32)}
     dense = stage(ElevationMap(0, layers, 0.05, (0.0, 0.0), "level"))
     np.testing.assert_array_equal(dense.layers["elevation"], [[np.nan, 1]])
     np.testing.assert_array_equal(dense.layers["count"], [[4, 5]])
+
+
+def test_the_mask_of_the_rovers_body_makes_its_pixels_unknown(written, tmp_path):
+    module = written("docs/writing-a-stage.md", "body_mask")
+    body = np.array([[0, 255]], np.uint8)
+    cv2.imwrite(str(tmp_path / "body.png"), body)
+    measured = np.full((1, 2), PixelOrigin.MEASURED, np.uint8)
+    disparity = Disparity(0, np.full((1, 2), 7, np.float32), measured, np.ones((1, 2), np.float32))
+    masked = module.MaskBody(image=str(tmp_path / "body.png"))(disparity)
+    np.testing.assert_array_equal(masked.pixels, [[7, np.nan]])
+    np.testing.assert_array_equal(known(masked.source), [[True, False]])
+    with pytest.raises(StageError, match="is not an image"):
+        module.MaskBody(image="none.png")(disparity)
 
 
 def test_two_images_become_a_picture_of_the_terrain(tmp_path, monkeypatch, capsys):
