@@ -106,7 +106,8 @@ class Mosaic:
         step = -(-max(self.shape) // max_side)
         rows, cols = (-(-length // step) for length in self.shape)
         blocks = (self.block(layer, row * step, 0, step, cols * step) for row in range(rows))
-        largest = [np.fmax.reduce(block.reshape(step, cols, step), axis=(0, 2)) for block in blocks]
+        squares = (block.reshape(step, cols, step) for block in blocks)
+        largest = [np.fmax.reduce(square, axis=(0, 2), keepdims=True).ravel() for square in squares]
         return np.stack(largest), step * self.resolution
 
     def tiles(self) -> Iterator[tuple[tuple[int, int], dict[str, Array]]]:

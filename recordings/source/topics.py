@@ -137,7 +137,7 @@ class DecodedTopics:
         if topic not in self._ahead:
             stamped = self.schemas.get(topic) in STAMPED_SCHEMAS
             times = self.file.times(self.channels_of(topic)) if stamped else np.zeros(0, np.int64)
-            raws = self.file.messages(self.channels_of(topic), int(times.max())) if len(times) else iter(())
+            raws = self.file.messages(self.channels_of(topic), int(np.max(times))) if len(times) else iter(())
             last = next((raw for raw in raws if isinstance(raw, RawMessage)), None)
             stamp = self.stamp_of(last) if last is not None else 0
             ahead = stamp - last.log_time if last is not None and stamp else 0

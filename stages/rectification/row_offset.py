@@ -145,11 +145,11 @@ def _view(pair: tuple[Array, Array]) -> tuple[Array, Array, Array, Array]:
 
 def _as_bright(image: Array, model: Array) -> Array:
     """An image scaled to the mean and the contrast of another, because tracking compares brightness."""
-    (mean, contrast), (other_mean, other_contrast) = (np.ravel(cv2.meanStdDev(each)) for each in (image, model))
+    (mean, contrast), (other_mean, other_contrast) = (np.ravel(cv2.meanStdDev(of)).tolist() for of in (image, model))
     if not contrast:
         return image
-    scale = float(other_contrast / contrast)
-    return cv2.convertScaleAbs(image, alpha=scale, beta=float(other_mean) - scale * float(mean))
+    scale = other_contrast / contrast
+    return cv2.convertScaleAbs(image, alpha=scale, beta=other_mean - scale * mean)
 
 
 def _centred(x: Array, y: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:

@@ -125,7 +125,7 @@ class Binarise(Stage):
 
     def _clear_or_unsure(self, elevation: ElevationMap) -> Array:
         """The reason of each cell without a hazard, (rows, cols): UNSURE where there is a doubt, else CLEAR."""
-        unsure = np.logical_or.reduce([np.zeros(elevation.shape, bool), *self.doubts(elevation).values()])
+        unsure = np.any([np.zeros(elevation.shape, bool), *self.doubts(elevation).values()], axis=0)
         return np.where(unsure, CellReason.UNSURE, CellReason.CLEAR)
 
     def doubts(self, elevation: ElevationMap) -> dict[str, Array]:

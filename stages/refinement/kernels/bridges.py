@@ -19,9 +19,9 @@ MIN_LENGTH = 4  # px, of a hole; in a shorter one the images decide little
 MIN_SEEN_LENGTH = 2.0  # px, of a hole in the right image; matches end a little before the edge of what is hidden
 MIN_CHANGE = 1.0  # px between the line and the background
 MIN_CONTRADICTION = 6  # mean gray levels between the images, well above noise
-MAX_DIFFERENCE = 20  # gray levels; a pixel that differs more counts no more
+MAX_DIFFERENCE = np.int64(20)  # gray levels; a pixel that differs more counts no more
 RADIUS = 1  # rows above and below whose images count
-PARTS = 16  # of a pixel; whole numbers sum to the same in any order
+PARTS = np.int64(16)  # of a pixel; whole numbers sum to the same in any order
 
 
 def bridge_holes(disparity: Array, filled: Array, kinds: Array, left: Array, right: Array) -> tuple[Array, Array]:
@@ -59,7 +59,7 @@ def _is_bridge(disparity, left, right, y, first, end, filled, kinds):
     before, after, length = disparity[y, first - 1], disparity[y, end], end - first
     if abs(after - before) < F32(MIN_SURFACE_STEP) or F32(length) - (after - before) < F32(MIN_SEEN_LENGTH):
         return False
-    change, by_fill, by_line, seen = F32(0), np.int64(0), np.int64(0), np.int64(0)
+    change, by_fill, by_line, seen = F32(0), np.int64(0), np.int64(0), 0
     for x in range(first, end):
         if kinds[y, x] == OPEN:
             return False
