@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from textwrap import wrap
 from typing import Any
 
@@ -28,9 +28,8 @@ ROWS = (
     "hazard cells (rock or over 20 deg): detected; called free, %",
     "visible cells left unknown; free cells that no camera could see, %",
 )
-
-
 SCORES = ("log", "density", "bad-0.5", "bad-1", "RMS px", "height cm", "missed", "false alarm", "unknown")
+_UNITS = {"RMS px": (1, "RMS (px)"), "height cm": (100, "height (cm)")}  # of `SCORES` other than %
 
 
 def format_score(found: Score) -> str:
@@ -84,6 +83,13 @@ def brief_row(name: str, values: Sequence[float]) -> tuple[str, ...]:
     density, half, one, rms, height, *cells = values
     shares = [_percent(value).replace("%", " %") for value in (density, half, one, *cells)]
     return (name, *shares[:3], _number(rms, 3), _number(100 * height, 2), *shares[3:])
+
+
+def brief_columns(rows: Iterable[Sequence[float]]) -> dict[str, list[float]]:
+    """Name with unit -> value of each row of `brief_figures`, in that unit."""
+    columns = zip(SCORES[1:], zip(*rows, strict=True), strict=False)  # no column without rows
+    scaled = ((*_UNITS.get(name, (100, f"{name} (%)")), column) for name, column in columns)
+    return {title: [scale * value for value in column] for scale, title, column in scaled}
 
 
 def _frame_lines(found: Score) -> list[str]:

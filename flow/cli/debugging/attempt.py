@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -67,15 +66,15 @@ def run(options: argparse.Namespace) -> int:
         title, setting = f"{options.log[0].name} at {part.at:g} s", swept_setting(changes)
         tables = ["\n\n".join([unchanged, *notes]), *tables]
 
-        def write(errors: list[list[str]]) -> None:
-            rows = ["## Errors", *_markdown_rows(errors)] if errors else []
+        def write(errors: Mapping[str, Sequence[float]]) -> None:
+            rows = ["## Errors", _markdown(_rows(errors))] if errors else []
             recording.write(out, title, "\n\n".join([*rows, *tables]), _sweep(setting, errors, differences))
 
-        write([])
+        write({})
         say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
         errors, unscored = _errors(paths, options.log[0])
         if errors:
-            say("\n" + "\n".join([*("  ".join(f"{cell:>12}" for cell in row) for row in errors), *unscored]))
+            say("\n" + "\n".join([*("  ".join(f"{cell:>12}" for cell in row) for row in _rows(errors)), *unscored]))
             from recordings.comparison.truth import error_pages
 
             recording.errors = [*error_pages(paths, options.log[0])]
@@ -104,39 +103,43 @@ def compared(
     return recording, differences, tables
 
 
-def _errors(paths: dict[str, Path], truth: Path) -> tuple[list[list[str]], list[str]]:
-    """A table of the errors against the truth of the log, a row for each variant, and what is not scored and why.
+def _errors(paths: dict[str, Path], truth: Path) -> tuple[dict[str, list[float]], list[str]]:
+    """Variant -> its errors against the truth of the log, as `brief_figures`, and what is not scored and why.
 
     Both are empty without truth.
     """
     from recordings.errors import LogError
     from recordings.scoring.score import score
-    from recordings.scoring.table import SCORES, brief_figures, brief_row
+    from recordings.scoring.table import brief_figures
 
-    rows, unscored = [["", *SCORES[1:]]], list[str]()
+    errors, unscored = dict[str, list[float]](), list[str]()
     for label, path in paths.items():
         try:
             found = score(path, truth, whole=False)
         except LogError:  # the log has no truth
-            return [], []
-        rows.append([*brief_row(label, brief_figures(found))])
+            return {}, []
+        errors[label] = brief_figures(found)
         unscored += [f"{label} not scored: {topic}: {why}" for topic, whys in found.unscored.items() for why in whys]
-    return rows, unscored
+    return errors, unscored
+
+
+def _rows(errors: Mapping[str, Sequence[float]]) -> list[tuple[str, ...]]:
+    """A table of the errors, with a head."""
+    from recordings.scoring.table import SCORES, brief_row
+
+    return [("", *SCORES[1:]), *(brief_row(label, figures) for label, figures in errors.items())]
 
 
 def _sweep(
-    setting: tuple[str, list[str]] | None, errors: Sequence[Sequence[str]], differences: Mapping[str, Diff]
+    setting: tuple[str, list[str]] | None, errors: Mapping[str, Sequence[float]], differences: Mapping[str, Diff]
 ) -> Sweep | None:
     """The errors, and the numbers of changed pixels and cells, over the values of a setting; None without one."""
     from recordings.comparison.sweep import Sweep, changed
+    from recordings.scoring.table import brief_columns
 
     if setting is None:
         return None
-    head, *rows = errors or [[]]
-    figures = {
-        _with_unit(name, "".join(column)): [math.nan if cell == "-" else float(cell.strip(" %")) for cell in column]
-        for name, *column in list(zip(head, *rows, strict=True))[1:]
-    }
+    figures = brief_columns(errors.values())
     counts = {label: changed(found) for label, found in differences.items()}
     for topic in dict.fromkeys(topic for each in counts.values() for topic in each):
         figures[f"{topic}: changed {'pixels' if 'disparity' in topic else 'cells'}"] = [
@@ -146,12 +149,6 @@ def _sweep(
     return Sweep(*setting, figures) if figures else None
 
 
-def _with_unit(name: str, cells: str) -> str:
-    """The name of a column with its unit in parentheses."""
-    text, _, unit = name.rpartition(" ")
-    return f"{name} (%)" if "%" in cells else f"{text} ({unit})"
-
-
-def _markdown_rows(rows: list[list[str]]) -> list[str]:
-    lines = [f"| {' | '.join(row)} |" for row in rows]
-    return ["\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])]
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
+    head, *lines = (f"| {' | '.join(row)} |" for row in rows)
+    return "\n".join([head, "|" + "---|" * len(rows[0]), *lines])

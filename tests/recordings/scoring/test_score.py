@@ -17,7 +17,16 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.scoring import score as scoring
 from recordings.scoring.stereo_metrics import SURFACES
-from recordings.scoring.table import ROWS, SCORES, brief_figures, brief_row, format_brief, format_score, terrain_lines
+from recordings.scoring.table import (
+    ROWS,
+    SCORES,
+    brief_columns,
+    brief_figures,
+    brief_row,
+    format_brief,
+    format_score,
+    terrain_lines,
+)  # fmt: skip
 from recordings.simulator import Simulation, ground_truth, write_log
 from recordings.simulator.texture import TerrainClass
 from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
@@ -233,6 +242,16 @@ def test_the_shares_of_a_blind_map_are_in_its_row_of_a_table(tmp_path, truth, fr
     nothing = scored(tmp_path, truth, frames, cells=BLIND["cells"])
     row = dict(zip(SCORES, brief_row("blind", brief_figures(nothing)), strict=True))
     assert (row["missed"], row["false alarm"], row["unknown"]) == ("0.00 %", "0.00 %", "100.00 %")
+
+
+def test_the_columns_of_several_rows_have_their_units():
+    columns = brief_columns([[0.98, 0.03, 0.02, 0.5, 0.0125, 0, 0.25, 0.5], [1, 0, 0, 0, math.nan, 0, 0, 1]])
+    assert columns["density (%)"] == [98, 100]
+    assert columns["RMS (px)"] == [0.5, 0]
+    assert columns["height (cm)"] == pytest.approx([1.25, math.nan], nan_ok=True)
+    assert columns["false alarm (%)"] == [25, 0]
+    assert len(columns) == len(SCORES) - 1
+    assert brief_columns([]) == {}
 
 
 def test_free_cells_on_rocks_or_out_of_view_are_shares_of_free_cells(tmp_path, truth, frames):
