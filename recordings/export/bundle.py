@@ -153,7 +153,7 @@ def _messages(result: Path, lost: Counter[str] | None, *topics: str | None) -> I
 
 @dataclass(eq=False)
 class MapFiles:
-    """Maps on one grid, as far as they have been read."""
+    """Maps on one grid, as far as they have been read. wanted: layers of the elevation map; none: all."""
 
     rim: float
     elevation: Mosaic | None = None
@@ -161,15 +161,17 @@ class MapFiles:
     colors: Tiles = field(default_factory=lambda: Tiles(CELL_COLOR))
     stamp: int = 0
     place: Georeference | None = None
+    wanted: Collection[str] = ()
 
     def add(self, result: Path, topics: MapTopics, stamp: int, frame: dict[str, Any]) -> None:
         """Add the maps of a frame."""
         self.stamp = stamp
         if topics.elevation in frame:
             terrain: ElevationMap = _read(ros2.read_grid_map, frame[topics.elevation], result)
-            fills = dict.fromkeys(terrain.layers, np.float32(np.nan))
+            layers = {name: terrain.layers[name] for name in self.wanted or terrain.layers}
+            fills = dict.fromkeys(layers, np.float32(np.nan))
             self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
-            self.elevation.add(terrain.layers, np.isfinite(terrain.layers["elevation"]), terrain)
+            self.elevation.add(layers, np.isfinite(terrain.layers["elevation"]), terrain)
         if topics.navigation in frame:
             cells: NavigationMap = _read(ros2.read_occupancy_grid, frame[topics.navigation], result)
             fill = {"cells": np.int8(Cell.UNKNOWN)}

@@ -84,7 +84,7 @@ def _add(facts: RunFacts, topic: str, stamp: int, message: Any) -> None:
             if "reason" in found:
                 facts.losses.append((found["stream"], found["stamp"], found["reason"], status.message))
     elif topic in REGIONAL:
-        maps = facts.regional.setdefault(message.header.frame_id, MapFiles(RIM_WIDTH))
+        maps = facts.regional.setdefault(message.header.frame_id, MapFiles(RIM_WIDTH, wanted=("elevation",)))
         maps.add(facts.path, REGIONAL, stamp, {topic: message})
     for name, value in values.items():
         facts.series.setdefault(name, {})[stamp] = value

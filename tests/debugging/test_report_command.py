@@ -76,7 +76,8 @@ def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_pat
             heights = np.tile(np.linspace(0, windows, 100 * windows, dtype=np.float32), (100, 1))
             drawn.append(ElevationMap(1, {"elevation": heights}, 0.1, (0.0, 0.0), frame_id))
             for number, part in enumerate(np.hsplit(heights, windows)):
-                grid = ElevationMap(number, {"elevation": part}, 0.1, (10.0 * number, 0.0), frame_id)
+                layers = {"elevation": part} | ({"slope": part} if number else {})  # others than heights do not matter
+                grid = ElevationMap(number, layers, 0.1, (10.0 * number, 0.0), frame_id)
                 writer.write("/nav/regional_map", ros2.grid_map(grid), 10 * len(drawn) + number)
     write_report(tmp_path / "out.html", [path])
     images = Page((tmp_path / "out.html").read_text()).images
