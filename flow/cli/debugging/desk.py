@@ -24,6 +24,7 @@ def run(options: argparse.Namespace) -> int:
     """Write a file for each desk."""
     from recordings.scoring.result_log import about_run
     from recordings.sinks.blueprint import APPLICATION, read_layout
+    from recordings.sinks.rerun_recording import check_room
 
     if about_run(options.recording):
         recording = options.recording.with_suffix(".rrd").name
@@ -35,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
     layout = read_layout(options.recording)
     for name, path in paths.items():
         with written(path) as temporary:
+            check_room(temporary, path)
             layout.blueprint(name).save(APPLICATION, str(temporary))
         say(f"wrote {path}; rerun {options.recording} {path} shows it")
     return COMPLETE

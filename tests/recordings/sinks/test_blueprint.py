@@ -139,6 +139,12 @@ def test_the_desks_of_a_recording_are_files_for_the_viewer(rrd, tmp_path, capsys
     assert "exists and is no desk of roverflow" in capsys.readouterr().err
 
 
+def test_a_desk_is_not_begun_on_a_full_disk(rrd, tmp_path, said, monkeypatch):
+    monkeypatch.setattr("recordings.sinks.rerun_recording.room_to_grow", lambda file: 1_000_000)
+    assert "less than 64 MB more can be written there; " in said(1, "desk", rrd, "--out", tmp_path).err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_is_no_recording_has_no_desk(tmp_path):
     (tmp_path / "a.rrd").write_text("nothing")
     for path in (tmp_path / "a.rrd", tmp_path / "b.rrd"):
