@@ -26,7 +26,7 @@ from recordings.simulator import Simulation, write_log
 from recordings.simulator.traverse import level_pose
 from recordings.sinks.mcap_sink import McapSink
 from stages.data import PixelOrigin, known
-from tests.conftest import FRAMES, SMALL, TRAVERSE, rewrite, roverflow, slow
+from tests.conftest import FRAMES, SMALL, TRAVERSE, mcap_rows, rewrite, roverflow, slow, write_mcap
 
 ROOT = Path(__file__).parent.parent
 RESULTS = {
@@ -211,6 +211,15 @@ def test_the_score_of_a_part_counts_that_part_alone(traverse, tmp_path, said, pa
     found = json.loads(score_file.read_text())
     assert (found["frames"], found["compared"], found["beyond"], found["missing"]) == (compared, compared, left_out, {})
     assert found["disparity"]["whole_image"]["nonocc"]["bad_1"] < 0.1
+
+
+def test_the_part_of_a_log_of_several_files_is_scored_as_that_of_one(traverse, tmp_path, said):
+    rows, out = mcap_rows(traverse), tmp_path / "out.mcap"
+    half = len(rows) // 2
+    files = [write_mcap(tmp_path / "a.mcap", rows[:half]), write_mcap(tmp_path / "b.mcap", rows[half:])]
+    said(0, "run", *files, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--end", 1.1)
+    printed = said(0, "score", out, "--truth", *files).out
+    assert printed.startswith("frames       2 of 2 have results\nnot counted  1 frame outside the part of the log ")
 
 
 def test_a_run_without_any_result_replaces_none(tmp_path, said):

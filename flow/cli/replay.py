@@ -47,6 +47,7 @@ def replay(
     from flow.runtime.interrupts import Stop, interrupts
     from flow.runtime.run import run
     from recordings.containers.digest import log_digest
+    from recordings.scoring.result_log import names_of
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
@@ -67,7 +68,7 @@ def replay(
             "roverflow": product_version(),
             "pipeline": graph.text,
             "overrides": "\n".join(overrides),
-            "log": ", ".join(path.name for path in dict.fromkeys(logs)),
+            "log": names_of(logs),
             "log_digest": log_digest(files) if files else "",
             "start": "" if start is None else repr(float(start)),
             "end": "" if end is None else repr(float(end)),

@@ -96,10 +96,11 @@ def to_utm(latitude: Array, longitude: Array, epsg: int) -> Array:
     return np.column_stack([FALSE_EASTING + SCALE * radius * east, base + SCALE * radius * north])
 
 
-def georeferences(result: Path, fixes: Sequence[Path], crs: str) -> dict[str, Georeference]:
-    """Frame of reference -> its place, by the poses of a result log and the fixes of one of several logs.
+def georeferences(result: Path, fixes: Sequence[Sequence[Path]], crs: str) -> dict[str, Georeference]:
+    """Frame of reference -> its place, by the poses of a result log and the fixes of the first log that has any.
 
-    Raises LogError if there are no fixes or poses, or if they leave the heading open.
+    fixes: logs, each of one or several files. Raises LogError if there are no fixes or poses, or if they leave the
+    heading open.
     """
     poses: dict[str, list[tuple[float, ...]]] = {}
     for _, stamp, message in iter_decoded(result, ["/nav/pose"]):
@@ -109,14 +110,14 @@ def georeferences(result: Path, fixes: Sequence[Path], crs: str) -> dict[str, Ge
         raise LogError(f"{result} has no poses; run the log with a pose stream")
     found = next((read for log in fixes if len(read := _fixes(log))), None)
     if found is None:
-        named = " or ".join(map(str, fixes))
+        named = " or ".join(", ".join(map(str, log)) for log in fixes)
         raise LogError(f"no fixes ({FIX}) are in {named}; give the log that has them with --fixes")
     epsg = zone_of(crs, *found[0, 1:])
     places = to_utm(found[:, 1], found[:, 2], epsg)
     return {name: _fitted(name, np.array(rows), found[:, 0], places, epsg) for name, rows in poses.items()}
 
 
-def _fixes(log: Path) -> Array:
+def _fixes(log: Sequence[Path]) -> Array:
     """(N, 3) stamp, ns, latitude and longitude, deg, of the first topic of fixes in a log."""
     with open_recording(log) as file:
         topics = DecodedTopics(file, 0, MAX_RATE)

@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -39,6 +39,9 @@ from recordings.mcap.index import (
 from recordings.mcap.message_order import ChunkMessages, LastTable, OpenChunks, Ordered, in_log_time_order, too_long
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for, is_packed
+
+if TYPE_CHECKING:
+    from recordings.containers.recording import Recording
 
 Edges = tuple[int | None, int | None]  # log times, ns, from which and before which messages are read
 
@@ -335,27 +338,33 @@ def iter_decoded(
     topics: those to read, by default all in CDR; lost: counts the reasons why messages were lost; part: of the log, by
     default all. Raises LogError at the first message that cannot be read, unless `lost` is given.
     """
+    with McapFile(Path(path)) as log:
+        yield from decoded(log, topics, lost, part)
+
+
+def decoded(
+    log: McapFile | Recording, topics: Iterable[str] | None, lost: Counter[str] | None, part: Edges = (None, None)
+) -> Iterator[tuple[str, int, Any]]:
+    """The same of an opened log."""
 
     def lose(why: str) -> None:
         if lost is None:
-            raise LogError(f"{path}: {why}")
+            raise LogError(f"{log.path}: {why}")
         lost[why] += 1
 
-    wanted = None if topics is None else set(topics)
-    with McapFile(Path(path)) as log:
-        decoders: dict[int, Callable[[bytes | memoryview], Any]] = {}
-        for number, channel in log.channels.items():
-            schema = channel.schema
-            if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
-                decoders[number] = decoder_for(schema.name, schema.encoding, schema.text)
-        for item in log.messages(set(decoders), *part):
-            if isinstance(item, LostMessage):
-                lose(item.reason)
-                continue
-            topic = log.channels[item.channel].topic
-            try:
-                message = decoders[item.channel](item.data)
-            except Exception as error:  # foreign bytes may fail a codec in any way
-                lose(f"{topic} at {item.log_time} ns cannot be decoded ({sentence_of(error)})")
-                continue
-            yield topic, item.log_time, message
+    wanted, decoders = None if topics is None else set(topics), dict[int, Callable[[bytes | memoryview], Any]]()
+    for number, channel in log.channels.items():
+        schema = channel.schema
+        if schema and channel.message_encoding == "cdr" and (wanted is None or channel.topic in wanted):
+            decoders[number] = decoder_for(schema.name, schema.encoding, schema.text)
+    for item in log.messages(set(decoders), *part):
+        if isinstance(item, LostMessage):
+            lose(item.reason)
+            continue
+        topic = log.channels[item.channel].topic
+        try:
+            message = decoders[item.channel](item.data)
+        except Exception as error:  # foreign bytes may fail a codec in any way
+            lose(f"{topic} at {item.log_time} ns cannot be decoded ({sentence_of(error)})")
+            continue
+        yield topic, item.log_time, message

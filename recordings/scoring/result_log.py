@@ -60,10 +60,25 @@ def pipeline_of(result: Path) -> str:
     return end_of_run(result).get("pipeline", "unknown")
 
 
-def part_run(result: Path, log: Path) -> tuple[float | None, float | None]:
-    """Start and end of the run in its input `log`, s after the first message; None for no limit or if unknown."""
+def input_beside(result: Path) -> list[Path]:
+    """The input of a run where it would be beside the result log: the file, the files or the folder."""
+    named = about_run(result).get("log") or result.name
+    beside = [[result.with_name(name) for name in names] for names in ([named], named.split(", "))]
+    return next((files for files in beside if all(file.exists() for file in files)), beside[0])
+
+
+def names_of(logs: Sequence[Path]) -> str:
+    """The name of a log of one or several files, as the facts of a run contain it."""
+    return ", ".join(path.name for path in dict.fromkeys(logs)).encode("utf-8", "replace").decode()
+
+
+def part_run(result: Path, logs: Sequence[Path]) -> tuple[float | None, float | None]:
+    """Start and end of the run in its input, s after the first message; None for no limit or if unknown.
+
+    logs: the files of the input, or its folder.
+    """
     about = about_run(result)
-    if about.get("log") != log.name.encode("utf-8", "replace").decode():
+    if about.get("log") != names_of(logs):
         return None, None
     start, end = (float(about[name]) if about.get(name) else None for name in ("start", "end"))
     return start, end

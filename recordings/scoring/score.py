@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import chain, islice
 from pathlib import Path
@@ -17,9 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from recordings.containers.opening import open_recording
 from recordings.containers.time_range import MAX_LATENESS_NS, TimeRange
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.file import McapFile, iter_decoded
+from recordings.mcap.file import McapFile, decoded, iter_decoded
 from recordings.mcap.input_copy import OWN_FRAME
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.metrics import aligned, angle_between
@@ -96,7 +98,7 @@ class Score:
         return json.dumps(_without_nan(asdict(self)), indent=2, allow_nan=False)
 
 
-def score(result: Path, truth: Path, whole: bool = True) -> Score:
+def score(result: Path, truth: Path | Sequence[Path], whole: bool = True) -> Score:
     """Score a result log.
 
     Parameters
@@ -104,7 +106,7 @@ def score(result: Path, truth: Path, whole: bool = True) -> Score:
     result
         The log that a run wrote.
     truth
-        The log with the truth topics (/truth/...), usually the run's input.
+        The log with the truth topics (/truth/...), usually the run's input: a file, several files or a folder.
     whole
         Whether to read all of the truth, to count the frames beyond the part that was run.
 
@@ -120,40 +122,43 @@ def score(result: Path, truth: Path, whole: bool = True) -> Score:
     >>> score(Path("out.mcap"), Path("traverse.mcap")).disparity["bad_1"]  # doctest: +SKIP
     0.0312
     """
-    result, truth = Path(result), Path(truth)
-    with McapFile(result), McapFile(truth) as log:  # without topics that have no message, unless messages were lost
+    result, files = Path(result), [Path(truth)] if isinstance(truth, Path | str) else [*map(Path, truth)]
+    name = ", ".join(map(str, files))
+    with McapFile(result), open_recording(files) as log:
+        # without topics that have no message, unless messages were lost
         topics = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}
-        part = TimeRange.after(log.start, *part_run(result, truth))
-    tally = _Tally(result, truth, topics, part, stamps_run(result))
-    results = iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])
-    lost, near = tally.lost[str(truth)], TimeRange() if whole else part.widened(MAX_LATENESS_NS)
-    mounts = iter_decoded(truth, ["/tf_static"], lost) if near.edges else ()
-    truths = chain(mounts, iter_decoded(truth, [*TRUTHS, "/tf_static"], lost, (near.low, near.high)))
-    for stamp, frame in frames(results, tally.noted(truths)):
-        if stamp in tally.outside and not frame.keys() & {*RESULTS}:
-            tally.found.beyond += 1
-            continue
-        try:
-            tally.add(stamp, frame)
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            where = f"{result} or {truth} has a message at {stamp} ns"
-            raise LogError(f"{where} that cannot be scored: {sentence_of(error)}; record it again") from error
+        part = TimeRange.after(log.start, *part_run(result, files))
+        tally = _Tally(result, name, topics, part, stamps_run(result))
+        results = iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])
+        lost, near = tally.lost[name], TimeRange() if whole else part.widened(MAX_LATENESS_NS)
+        mounts = decoded(log, ["/tf_static"], lost) if near.edges else ()
+        truths = chain(mounts, decoded(log, [*TRUTHS, "/tf_static"], lost, (near.low, near.high)))
+        for stamp, frame in frames(results, tally.noted(truths)):
+            if stamp in tally.outside and not frame.keys() & {*RESULTS}:
+                tally.found.beyond += 1
+                continue
+            try:
+                tally.add(stamp, frame)
+            except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+                where = f"{result} or {name} has a message at {stamp} ns"
+                raise LogError(f"{where} that cannot be scored: {sentence_of(error)}; record it again") from error
     return tally.score()
 
 
 class _Tally:
     """Sums up frames, and keeps one row of metrics of each.
 
-    truths: topics of the truth; part: of the log that was run; taken: stamps of the frames that it took, None for all.
+    truth: the name of the log with it; truths: its topics; part: of the log that was run; taken: stamps of the frames
+    that it took, None for all.
     """
 
-    def __init__(self, result: Path, truth: Path, truths: set[str], part: TimeRange, taken: set[int] | None) -> None:
+    def __init__(self, result: Path, truth: str, truths: set[str], part: TimeRange, taken: set[int] | None) -> None:
         self.result, self.truth, self.truths, self.part, self.taken = result, truth, truths, part, taken
         self.found = Score()
         self.mounts: dict[str, Any] = {}
         self.fitting = False  # whether a map of any frame was scored
         self.left_out: set[str] = set()  # topics of the current frame
-        self.lost: dict[str, Counter[str]] = {str(log): Counter() for log in (result, truth)}
+        self.lost: dict[str, Counter[str]] = {log: Counter() for log in (str(result), truth)}
         self.outside: set[int] = set()  # stamps of the truth outside the part that was run
         self.seen_results: set[str] = set()
         self.disparity: StereoErrors | None = None
@@ -299,7 +304,7 @@ class _Tally:
         """The score. Raises LogError if there was nothing to compare."""
         found = self.found
         if not found.frames:
-            damage = "".join(f" ({why})" for why in islice(self.lost[str(self.truth)], 1))
+            damage = "".join(f" ({why})" for why in islice(self.lost[self.truth], 1))
             raise LogError(
                 f"{self.truth} has no ground truth (/truth/...){damage}; give the log that has it with --truth"
             )

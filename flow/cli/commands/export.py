@@ -30,8 +30,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="an elevation or navigation map of the pipeline by its stream's name, not the regional one",
     )  # fmt: skip
     sub.add_argument("--crs", metavar="CRS", help="place the regional map by GNSS fixes: utm, or a zone as EPSG:32633")
-    fixes = "log with the fixes (the result itself, or its input beside it)"
-    sub.add_argument("--fixes", type=Path, metavar="LOG", help=fixes)
+    fixes = "log with the fixes: files or a folder (the result itself, or its input beside it)"
+    sub.add_argument("--fixes", type=Path, nargs="+", metavar="LOG", help=fixes)
     one_map = "merge the regional maps of several logs, whose poses are in one frame, into one"
     sub.add_argument("--merge", action="store_true", help=one_map)
 
@@ -83,12 +83,12 @@ def _places(options: argparse.Namespace, result: Path) -> dict[str, Georeference
     if options.crs is None:
         return {}
     from recordings.export.georeference import georeferences
-    from recordings.scoring.result_log import about_run
+    from recordings.scoring.result_log import input_beside
 
     if options.frames:
         raise UsageError("--crs places regional maps; leave out --frames")
-    beside = result.with_name(about_run(result).get("log") or result.name)
-    logs = [options.fixes] if options.fixes else [result, *([beside] if beside.exists() else [])]
+    beside = input_beside(result)
+    logs = [options.fixes] if options.fixes else [[result], *([beside] if beside[0].exists() else [])]
     places = georeferences(result, logs, options.crs)
     for name, place in places.items():
         say(place.sentence(name))

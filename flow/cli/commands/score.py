@@ -15,7 +15,8 @@ HELP = "print the errors of a result log, or of the logs of a fleet, against gro
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log, or the folder of a fleet")
-    sub.add_argument("--truth", type=Path, metavar="LOG.mcap", help="log with the /truth topics (the result itself)")
+    truth = "log with the /truth topics: files or a folder (the result itself)"
+    sub.add_argument("--truth", type=Path, nargs="+", metavar="LOG", help=truth)
     sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure as JSON")
 
 
@@ -26,8 +27,8 @@ def run(options: argparse.Namespace) -> int:
     from recordings.scoring.score import score
     from recordings.scoring.table import format_score
 
-    truth = options.truth or options.result
-    check_outputs({"score": options.json}, [options.result, truth])
+    truth = options.truth or [options.result]
+    check_outputs({"score": options.json}, [options.result, *truth])
     result = score(options.result, truth)
     write_text(options.json, result.to_json())
     say(format_score(result))

@@ -72,12 +72,12 @@ def run(options: argparse.Namespace) -> int:
 
         write({})
         say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
-        errors, unscored = _errors(paths, options.log[0])
+        errors, unscored = _errors(paths, options.log)
         if errors:
             say("\n" + "\n".join([*("  ".join(f"{cell:>12}" for cell in row) for row in _rows(errors)), *unscored]))
             from recordings.comparison.truth import error_pages
 
-            recording.errors = [*error_pages(paths, options.log[0])]
+            recording.errors = [*error_pages(paths, options.log)]
             write(errors)
             say(f"\nadded the errors to {out}")
     return COMPLETE
@@ -103,7 +103,7 @@ def compared(
     return recording, differences, tables
 
 
-def _errors(paths: dict[str, Path], truth: Path) -> tuple[dict[str, list[float]], list[str]]:
+def _errors(paths: dict[str, Path], truth: Sequence[Path]) -> tuple[dict[str, list[float]], list[str]]:
     """Variant -> its errors against the truth of the log, as `brief_figures`, and what is not scored and why.
 
     Both are empty without truth.

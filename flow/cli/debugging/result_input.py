@@ -51,11 +51,9 @@ def input_of(
     Raises UsageError if it is not there, cannot be read, or has none of the result's frames.
     """
     from recordings.errors import LogError
-    from recordings.scoring.result_log import about_run
+    from recordings.scoring.result_log import about_run, input_beside
 
-    named = about_run(result)["log"]
-    beside = [[result.with_name(name) for name in names] for names in ([named], named.split(", "))]
-    given = next((files for files in beside if all(file.exists() for file in files)), beside[0])
+    named, given = about_run(result)["log"], input_beside(result)
     if log is not None:
         given = [Path(log)] if isinstance(log, Path | str) else [*map(Path, log)]
     for file in given:

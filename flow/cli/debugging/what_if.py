@@ -17,7 +17,7 @@ from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted, run
 from flow.runtime.variants import Variants, VariantSink, merged, sink_of
-from recordings.scoring.result_log import stamps_of
+from recordings.scoring.result_log import names_of, stamps_of
 
 MAX_VARIANTS = 26  # one letter each
 
@@ -88,7 +88,7 @@ def run_variants(
             notes.append(f"note: the log has only {counted(part.frames, 'frame')} from there on, not {frames}")
         log.narrow(part.start, part.end)
         about = {
-            "roverflow": product_version(), "log": ", ".join(path.name for path in dict.fromkeys(logs)),
+            "roverflow": product_version(), "log": names_of(logs),
             "start": repr(part.first), "end": repr(part.end), "every": "",
         }  # fmt: skip
         sinks = tuple(

@@ -30,7 +30,7 @@ def test_each_variant_has_a_page_of_each_frame_with_truth(traverse, fast_result)
         {stamp_of(message.header): read_disparity(message) for _, _, message in iter_decoded(path, [topic])}
         for path, topic in ((fast_result, "/nav/disparity"), (traverse, "/truth/disparity"))
     )
-    pages = list(error_pages({"A": fast_result, "B": fast_result}, traverse))
+    pages = list(error_pages({"A": fast_result, "B": fast_result}, [traverse]))
     assert [label for label, _, _ in pages] == ["A"] * len(estimates) + ["B"] * len(estimates)
     expected = {stamp: error_page(estimates[stamp], truths[stamp]) for stamp in estimates}
     assert {stamp: page for _, stamp, page in pages} == expected

@@ -10,6 +10,7 @@ from recordings.export.georeference import georeferences, to_utm, zone_of
 from recordings.importers.recording import fix
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
+from recordings.scoring.result_log import about_run
 from tests.conftest import FRAMES, roverflow
 
 TURN, ORIGIN = np.radians(37.0), np.array([412_345.6, 5_432_100.7])  # of the map's frame in zone 33
@@ -82,10 +83,24 @@ def test_a_map_is_placed_to_a_centimetre(result, tmp_path, capsys):
     np.testing.assert_allclose(lines[4:], centre, atol=1e-6)
 
 
+def test_the_fixes_of_all_files_of_an_input_count(result, tmp_path, said):
+    out, (stamps, places) = tmp_path / "out.mcap", driven(result)
+    about = {**about_run(result), "log": "a.mcap, b.mcap"}
+    with Ros2Writer(out) as log:
+        log.metadata("roverflow", about)
+        for topic, stamp, message in iter_decoded(result, ["/nav/pose", "/nav/regional_map", "/tf"]):
+            log.write(topic, message, stamp)
+    for name, part in (("a", slice(0, 1)), ("b", slice(1, None))):
+        write_fixes(tmp_path / f"{name}.mcap", stamps[part], on_grid(places[part], scale_at(ORIGIN[0])))
+    for number, fixes in enumerate([(), ("--fixes", tmp_path / "b.mcap", tmp_path / "a.mcap")]):
+        printed = said(0, "export", out, tmp_path / f"maps-{number}", "--crs", "utm", *fixes).out
+        assert f"by {FRAMES} fixes: residual 0.00 m RMS" in printed
+
+
 def test_the_stated_errors_are_those_of_the_fixes(result, tmp_path):
     stamps, places = driven(result)
     log = write_fixes(tmp_path / "fixes.mcap", stamps, on_grid(places, scale_at(ORIGIN[0])), 0.005)
-    (found,) = georeferences(result, [log], "EPSG:32633").values()
+    (found,) = georeferences(result, [[log]], "EPSG:32633").values()
     assert 0.001 < found.residual < 0.02
     assert abs(np.degrees(found.heading) - 37) < 4 * np.degrees(found.sigma)
 

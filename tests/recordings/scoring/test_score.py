@@ -30,7 +30,7 @@ from recordings.scoring.table import (
 from recordings.simulator import Simulation, ground_truth, write_log
 from recordings.simulator.texture import TerrainClass
 from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
-from tests.conftest import chunks_of, rewrite, with_broken
+from tests.conftest import chunks_of, mcap_rows, rewrite, with_broken, write_mcap
 
 SMALL = Simulation(
     scene="mixed", frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
@@ -356,6 +356,17 @@ def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, trut
         writer.write("/nav/dense", ros2.grid_map(ElevationMap(1, ones, 0.05, (0, 0), "level")), 1)
     with pytest.raises(LogError, match=r"none of /nav/disparity, .*, only /nav/dense: the run produced none, or"):
         scoring.score(tmp_path / "other.mcap", truth)
+
+
+def test_a_truth_in_several_files_is_that_of_one(tmp_path, truth, frames):
+    run, folder = Run(blind=(1,)).write(tmp_path / "run.mcap", frames), tmp_path / "bag"
+    folder.mkdir()
+    rows = mcap_rows(truth)
+    halves = rows[: len(rows) // 2], rows[len(rows) // 2 :]
+    files = [write_mcap(folder / f"bag_{number}.mcap", half) for number, half in enumerate(halves)]
+    whole = scoring.score(run, truth)
+    assert whole.frames == 2
+    assert scoring.score(run, files).to_json() == scoring.score(run, folder).to_json() == whole.to_json()
 
 
 def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth, frames):
