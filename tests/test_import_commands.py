@@ -40,15 +40,12 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     assert refined["density"] > matched["density"]
 
 
-@pytest.mark.parametrize(
-    ("spoilt", "out", "words"),
-    [
-        ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
-        (None, "Box/im0.png", "is an input of this command"),
-        (None, "Box", "is a folder or a device"),
-        (None, "Bex.png", "no input log of roverflow"),
-    ],
-)
+@pytest.mark.parametrize(("spoilt", "out", "words"), [
+    ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
+    (None, "Box/im0.png", "is an input of this command"),
+    (None, "Box", "is a folder or a device"),
+    (None, "Bex.png", "no input log of roverflow"),
+])  # fmt: skip
 def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, refused, spoilt, out, words):
     scene = write_scene(tmp_path / "Box")
     if out == "Bex.png":
@@ -67,14 +64,11 @@ def test_the_help_of_import_names_its_assumptions(capsys):
     assert "assumes level, 1 m above ground" in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.parametrize(
-    ("given", "lacking"),
-    [
-        ((), "SOURCE, OUT.mcap, --calibration, --height, --pitch-down or --attitudes"),
-        (("a", "b.mcap", "--height", 1), "--calibration, --pitch-down or --attitudes"),
-        (("a", "b.mcap", "--height", 1, "--attitudes", "a.csv"), "--calibration"),
-    ],
-)
+@pytest.mark.parametrize(("given", "lacking"), [
+    ((), "SOURCE, OUT.mcap, --calibration, --height, --pitch-down or --attitudes"),
+    (("a", "b.mcap", "--height", 1), "--calibration, --pitch-down or --attitudes"),
+    (("a", "b.mcap", "--height", 1, "--attitudes", "a.csv"), "--calibration"),
+])  # fmt: skip
 def test_one_sentence_names_all_that_a_command_line_lacks(given, lacking, capsys):
     with pytest.raises(SystemExit) as caught:
         roverflow("import", "images", *given)

@@ -27,18 +27,14 @@ def drop(*parts: str):
     return lambda topic, index, data: None if any(part in topic for part in parts) else data
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (drop("/imu", "/truth"), "tilt"),
-        (drop("camera_info"), "CameraInfo"),
-        (drop("/right"), "only one image topic"),
-        (drop("/tf_static"), "tf_static"),
-        (drop("/"), "no messages"),
-        (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0xyzw\0"), "encoding 'xyzw' is not supported"),
-    ],
-    ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing", "an encoding nobody reads"],
-)
+@pytest.mark.parametrize(("change", "words"), [
+    (drop("/imu", "/truth"), "tilt"),
+    (drop("camera_info"), "CameraInfo"),
+    (drop("/right"), "only one image topic"),
+    (drop("/tf_static"), "tf_static"),
+    (drop("/"), "no messages"),
+    (lambda topic, index, data: data.replace(b"\0rgb8\0", b"\0xyzw\0"), "encoding 'xyzw' is not supported"),
+], ids=["no tilt", "no calibration", "one camera", "no mounting", "nothing", "an encoding nobody reads"])  # fmt: skip
 def test_an_incomplete_log_is_refused_in_one_sentence(traverse, tmp_path, refused, change, words):
     log = rewrite(traverse, tmp_path / "lacking.mcap", change)
     assert words in refused("run", log, "-o", tmp_path / "out.mcap")
@@ -155,14 +151,11 @@ def test_the_demo_refuses_a_folder_with_other_files(traverse, tmp_path, refused)
     check_folder(folder)
 
 
-@pytest.mark.parametrize(
-    ("option", "name", "words"),
-    [
-        ("-o", "nowhere/out.mcap", "there is no folder"),
-        *((option, "taken", "taken is a folder or a device") for option in ("-o", "--rrd", "--summary")),
-        *((option, "out.mcap", "is given for two outputs") for option in ("--rrd", "--summary")),
-    ],
-)
+@pytest.mark.parametrize(("option", "name", "words"), [
+    ("-o", "nowhere/out.mcap", "there is no folder"),
+    *((option, "taken", "taken is a folder or a device") for option in ("-o", "--rrd", "--summary")),
+    *((option, "out.mcap", "is given for two outputs") for option in ("--rrd", "--summary")),
+])  # fmt: skip
 def test_an_impossible_output_is_refused_before_anything_runs(traverse, tmp_path, refused, option, name, words):
     (tmp_path / "taken").mkdir()
     assert words in refused("run", traverse, "-o", tmp_path / "out.mcap", option, tmp_path / name)
@@ -219,15 +212,12 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeyp
     assert roverflow("export", result, folder) == 0
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "printed"),
-    [
-        ("--slope", "80", "--slope must be at most 45 deg, not 80 deg"),
-        ("--size", "1x20", "the width of --size must be at least 16 px, not 1 px"),
-        ("--odometry-scale", "300", "--odometry-scale must be at most 100 %, not 300 %"),
-        ("--rocks", "nan", "--rocks must be a finite number"),
-    ],
-)
+@pytest.mark.parametrize(("option", "value", "printed"), [
+    ("--slope", "80", "--slope must be at most 45 deg, not 80 deg"),
+    ("--size", "1x20", "the width of --size must be at least 16 px, not 1 px"),
+    ("--odometry-scale", "300", "--odometry-scale must be at most 100 %, not 300 %"),
+    ("--rocks", "nan", "--rocks must be a finite number"),
+])  # fmt: skip
 def test_a_simulation_beyond_its_limits_is_refused_by_option(tmp_path, refused, option, value, printed):
     assert re.search(printed, refused("simulate", tmp_path / "log.mcap", option, value))
     assert not list(tmp_path.iterdir())
@@ -307,32 +297,26 @@ def test_a_full_disk_is_reported_in_one_sentence():
     assert done.stderr.startswith("roverflow: the output: No space left on device")
 
 
-@pytest.mark.parametrize(
-    ("key", "topic", "there"),
-    [
-        ("odometry", "/nix", "its pose topics are /odometry"),
-        ("odometry", "/stereo/left/camera_info", "its pose topics are /odometry"),
-        ("odometry", "/tf_static", "its pose topics are /odometry"),
-        ("left", "/nix", "its image topics are /stereo/left/image_rect_color"),
-        ("right_info", "/nix", "its CameraInfo topics are /stereo/left/camera_info"),
-        ("inclinometer", "/nix", "its tilt topics are /imu"),
-        ("inclinometer", "/odometry", "its tilt topics are /imu"),
-    ],
-)
+@pytest.mark.parametrize(("key", "topic", "there"), [
+    ("odometry", "/nix", "its pose topics are /odometry"),
+    ("odometry", "/stereo/left/camera_info", "its pose topics are /odometry"),
+    ("odometry", "/tf_static", "its pose topics are /odometry"),
+    ("left", "/nix", "its image topics are /stereo/left/image_rect_color"),
+    ("right_info", "/nix", "its CameraInfo topics are /stereo/left/camera_info"),
+    ("inclinometer", "/nix", "its tilt topics are /imu"),
+    ("inclinometer", "/odometry", "its tilt topics are /imu"),
+])  # fmt: skip
 def test_a_topic_that_is_set_but_absent_is_refused(traverse, tmp_path, refused, key, topic, there):
     printed = refused("run", traverse, "--set", f"source.{key}={topic}", "-o", tmp_path / "out.mcap")
     assert f"the source's '{key}' is set to {topic}, which is not a suitable topic of the log ({there}" in printed
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("field", "words"),
-    [
-        ("orientation.xx", "no 'xx' in its geometry_msgs/msg/Quaternion (it has x, y, z, w)"),
-        ("orientation", "field 'orientation' contains a geometry_msgs/msg/Quaternion, which is not a number"),
-        ("header.frame_id", "which is not a number"),
-    ],
-)
+@pytest.mark.parametrize(("field", "words"), [
+    ("orientation.xx", "no 'xx' in its geometry_msgs/msg/Quaternion (it has x, y, z, w)"),
+    ("orientation", "field 'orientation' contains a geometry_msgs/msg/Quaternion, which is not a number"),
+    ("header.frame_id", "which is not a number"),
+])  # fmt: skip
 def test_angles_of_an_absent_field_are_refused_before_the_run(traverse, tmp_path, refused, field, words):
     with McapSource().open(traverse) as opened:
         imu = opened.topics["inclinometer"]
@@ -391,18 +375,15 @@ def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
     assert not list(tmp_path.glob("*.partial"))
 
 
-@pytest.mark.parametrize(
-    ("command", "usage", "words"),
-    [
-        ("rnu a.mcap", "roverflow", "there is no command 'rnu'; did you mean 'run'?"),
-        ("import kiti a", "roverflow", "there is no kind of import 'kiti'; did you mean 'kitti'?"),
-        ("export a.mcap b --mpa x", "roverflow export", "unknown: --mpa x; did you mean '--map'?"),
-        ("run a b --recording x", "roverflow run", f"unknown: --recording x; roverflow run {OPTIONS}"),
-        ("run a b --ever 2 --sumary s.json", "roverflow run", "unknown: --sumary s.json; did you mean '--summary'?"),
-        ("try a --at 0 --set b.c=1 --dis", "roverflow try", f"unknown: --dis; roverflow try {OPTIONS}"),
-        ("score a.mcap -x", "roverflow score", "unknown: -x; roverflow score --help lists the options"),
-    ],
-)
+@pytest.mark.parametrize(("command", "usage", "words"), [
+    ("rnu a.mcap", "roverflow", "there is no command 'rnu'; did you mean 'run'?"),
+    ("import kiti a", "roverflow", "there is no kind of import 'kiti'; did you mean 'kitti'?"),
+    ("export a.mcap b --mpa x", "roverflow export", "unknown: --mpa x; did you mean '--map'?"),
+    ("run a b --recording x", "roverflow run", f"unknown: --recording x; roverflow run {OPTIONS}"),
+    ("run a b --ever 2 --sumary s.json", "roverflow run", "unknown: --sumary s.json; did you mean '--summary'?"),
+    ("try a --at 0 --set b.c=1 --dis", "roverflow try", f"unknown: --dis; roverflow try {OPTIONS}"),
+    ("score a.mcap -x", "roverflow score", "unknown: -x; roverflow score --help lists the options"),
+])  # fmt: skip
 def test_an_unknown_name_is_answered_with_the_usage_and_the_nearest(command, usage, words, capsys):
     with pytest.raises(SystemExit, match="2"):
         roverflow(*command.split())

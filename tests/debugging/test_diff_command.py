@@ -30,16 +30,13 @@ def test_a_run_and_the_same_run_are_equal_and_make_no_recording(fast_result, var
         assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("change", "topic", "measure"),
-    [
-        ("disparity/full.paths=8", "/nav/disparity", "largest px"),
-        *slow(
-            ("cells.max_range=4 m", "/nav/elevation_map", "cells known only in A"),
-            ("navigation_map.rover.max_step=5 cm", "/nav/navigation_map", "cells from free to hazard"),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "topic", "measure"), [
+    ("disparity/full.paths=8", "/nav/disparity", "largest px"),
+    *slow(
+        ("cells.max_range=4 m", "/nav/elevation_map", "cells known only in A"),
+        ("navigation_map.rover.max_step=5 cm", "/nav/navigation_map", "cells from free to hazard"),
+    ),
+])  # fmt: skip
 def test_the_first_difference_is_in_the_stream_that_a_setting_touches(
     fast_result, variant_of, said, tmp_path, change, topic, measure
 ):

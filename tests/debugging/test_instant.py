@@ -22,15 +22,11 @@ def stamps(traverse):
         return [item.stamp for _, stream, item in log.events(("left",)) if stream == "left"]
 
 
-@pytest.mark.parametrize(
-    "shown",
-    [
-        lambda stamp: str(np.datetime64(stamp, "ns")).replace("T", " "),
-        lambda stamp: f"{np.datetime64(stamp, 'ns').astype('datetime64[us]')}Z",
-        lambda stamp: str(np.datetime64(stamp, "ns"))[11:23],
-        lambda stamp: f"{stamp} ns",
-    ],
-)
+@pytest.mark.parametrize("shown", [
+    lambda stamp: str(np.datetime64(stamp, "ns")).replace("T", " "),
+    lambda stamp: f"{np.datetime64(stamp, 'ns').astype('datetime64[us]')}Z",
+    lambda stamp: str(np.datetime64(stamp, "ns"))[11:23], lambda stamp: f"{stamp} ns",
+])  # fmt: skip
 def test_a_time_as_the_viewer_shows_it_is_that_of_the_frame(traverse, stamps, shown):
     with McapSource().open(traverse) as log:
         for stamp in stamps:

@@ -112,10 +112,9 @@ def test_without_the_pose_of_visual_odometry_its_map_has_no_state(run, tmp_path)
     assert ("pose" in without) == visual
 
 
-@pytest.mark.parametrize(
-    ("frame", "found"), [("visual_odom", True), ("visual_odom/2", True), ("visual_odom_ekf", False),
-    ("visual_odom/map", False)],
-)  # fmt: skip
+@pytest.mark.parametrize(("frame", "found"), [
+    ("visual_odom", True), ("visual_odom/2", True), ("visual_odom_ekf", False), ("visual_odom/map", False),
+])  # fmt: skip
 def test_only_poses_in_a_frame_of_visual_odometry_continue(run, frame, found, tmp_path):
     def rename(_, message):
         message.header.frame_id = frame
@@ -136,13 +135,10 @@ def test_a_state_that_variants_share_is_made_once(run, monkeypatch):
     assert [stage.max_range for stage in made] == [8.0, 4.0]
 
 
-@pytest.mark.parametrize(
-    ("option", "sentence"),
-    [
-        (("--every", 2), "has only the frames of --every 2; give the result of a whole run\n"),
-        (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2\n"),
-    ],
-)
+@pytest.mark.parametrize(("option", "sentence"), [
+    (("--every", 2), "has only the frames of --every 2; give the result of a whole run\n"),
+    (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2\n"),
+])  # fmt: skip
 def test_a_result_without_the_state_of_each_frame_is_refused(traverse, option, sentence, tmp_path, refused):
     result, rest = tmp_path / "out.mcap", ("-o", tmp_path / "try.rrd")
     assert roverflow("run", traverse, "-p", "fast", *SMALL, "--end", 0.7, *option, "-o", result, "--no-rrd") == 0

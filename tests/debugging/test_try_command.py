@@ -125,17 +125,11 @@ def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, said):
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("--at", "99", *SMALL), "--at 99 is outside the images of the log"),
-        (("--at", "0", *SMALL, "--set", "source.left=/nix"), "a change of the source needs a run of its own"),
-        (("--at", "0", "--set", "stereo.slop=9 ms"), "a change of 'stereo', which makes the frames, needs a run of"),
-        (
-            ("--at", "0", *SMALL, *SMALL, *SMALL[:1], "a=1", *SMALL[:1], "a=2"),
-            "only one setting may have several values",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (("--at", "99", *SMALL), "--at 99 is outside the images of the log"),
+    (("--at", "0", *SMALL, "--set", "source.left=/nix"), "a change of the source needs a run of its own"),
+    (("--at", "0", "--set", "stereo.slop=9 ms"), "a change of 'stereo', which makes the frames, needs a run of"),
+    (("--at", "0", *SMALL, *SMALL, *SMALL[:1], "a=1", *SMALL[:1], "a=2"), "only one setting may have several values"),
+])  # fmt: skip
 def test_what_cannot_be_tried_is_refused(traverse, tmp_path, refused, arguments, sentence):
     assert sentence in refused("try", traverse, *arguments, "-o", tmp_path / "try.rrd")

@@ -243,13 +243,10 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, sai
         assert why_not in refused("why", fast_result, *late[:2], cell, *late[3:])
 
 
-@pytest.mark.parametrize(
-    ("given", "why_not"),
-    [
-        (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2"),
-        (("--set", "McapSink.results=[points]"), "contains no /nav/regional_navigation_map, only /nav/diag"),
-    ],
-)
+@pytest.mark.parametrize(("given", "why_not"), [
+    (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2"),
+    (("--set", "McapSink.results=[points]"), "contains no /nav/regional_navigation_map, only /nav/diag"),
+])  # fmt: skip
 def test_a_result_without_the_regional_map_is_refused(traverse, tmp_path, refused, given, why_not):
     out, part = tmp_path / "out.mcap", ("--end", 0.8, "--no-rrd")
     assert roverflow("run", traverse, "-p", "fast", *SMALL, *part, *given, "-o", out) == 0

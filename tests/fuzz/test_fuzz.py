@@ -30,11 +30,9 @@ def _answers():
     return []
 
 
-@pytest.mark.parametrize(
-    ("work", "fault"),
-    [(_refuses, ""), (_fails, "KeyError"), (_fills_the_memory, "took"), (_answers, "")],
-    ids=["refusal", "another exception", "much memory", "result"],
-)
+@pytest.mark.parametrize(("work", "fault"), [
+    (_refuses, ""), (_fails, "KeyError"), (_fills_the_memory, "took"), (_answers, ""),
+], ids=["refusal", "another exception", "much memory", "result"])  # fmt: skip
 def test_only_refusals_and_results_are_no_findings(work, fault):
     assert isolated(work).fault.partition(":")[0].partition(" ")[0] == fault
 

@@ -33,17 +33,14 @@ def test_a_stage_has_its_inputs_and_output():
     assert match.output == "Disparity"
 
 
-@pytest.mark.parametrize(
-    ("stage", "name", "values", "default"),
-    [
-        ("stages.Match", "disparities", "1 to 1024 px", "192 px"),
-        ("Match", "paths", "4, 8", "8"),
-        ("Binarise", "rover.max_slope", "0 to 89 deg", "20 deg"),
-        ("TerrainFeatures", "rover.footprint", "5 cm to 20 m", "1 m"),
-        ("flow.align.pair", "slop", "at least 0", "5 ms"),
-        ("McapSink", "compression", "lz4, zstd, none", "lz4"),
-    ],
-)
+@pytest.mark.parametrize(("stage", "name", "values", "default"), [
+    ("stages.Match", "disparities", "1 to 1024 px", "192 px"),
+    ("Match", "paths", "4, 8", "8"),
+    ("Binarise", "rover.max_slope", "0 to 89 deg", "20 deg"),
+    ("TerrainFeatures", "rover.footprint", "5 cm to 20 m", "1 m"),
+    ("flow.align.pair", "slop", "at least 0", "5 ms"),
+    ("McapSink", "compression", "lz4, zstd, none", "lz4"),
+])  # fmt: skip
 def test_ranges_and_defaults_are_written_as_in_a_pipeline_file(stage, name, values, default):
     item = parameters(stage)[name]
     assert (item.range, item.default) == (values, default)

@@ -68,16 +68,13 @@ def test_a_use_sets_parameters_and_keeps_the_defaults_of_others(tmp_path):
     assert factors(loaded(tmp_path)) == {"out/first": 0.25, "out": 3.0}
 
 
-@pytest.mark.parametrize(
-    ("override", "expected"),
-    [
-        ("stretch=4 m", {"out/first": 4.0, "out": 3.0}),
-        ("out.second=5 m", {"out/first": 0.25, "out": 5.0}),
-        ("out/first.factor=6 m", {"out/first": 6.0, "out": 3.0}),
-        ("out/last.factor=7 m", {"out/first": 0.25, "out": 7.0}),
-        ("out/first.factor=$stretch", {"out/first": 0.25, "out": 3.0}),
-    ],
-)
+@pytest.mark.parametrize(("override", "expected"), [
+    ("stretch=4 m", {"out/first": 4.0, "out": 3.0}),
+    ("out.second=5 m", {"out/first": 0.25, "out": 5.0}),
+    ("out/first.factor=6 m", {"out/first": 6.0, "out": 3.0}),
+    ("out/last.factor=7 m", {"out/first": 0.25, "out": 7.0}),
+    ("out/first.factor=$stretch", {"out/first": 0.25, "out": 3.0}),
+])  # fmt: skip
 def test_the_command_line_sets_parameters_and_inner_streams(tmp_path, override, expected):
     assert factors(loaded(tmp_path, overrides=[override])) == expected
 
@@ -109,49 +106,46 @@ def test_optional_applies_to_the_inner_streams(tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("{template: scaled_twice", "{template: scald_twice",
-         "toy.yaml:13: there is no template 'scald_twice'; did you mean 'scaled_twice'?"),
-        ("{template: scaled_twice", "{template: mine.yaml",
-         "toy.yaml:13: there is no template 'mine.yaml'; write it under 'templates' of the pipeline file"),
-        ("couple: both, factor", "factor",
-         "toy.yaml:13: 'out' lacks its input 'couple' (template 'scaled_twice' needs it)"),
-        ("both, factor:", "both, faktor:",
-         "toy.yaml:13: template 'scaled_twice' has no input or parameter 'faktor'; did you mean 'factor'?"),
-        ("couple: both,", "couple: bath,", "toy.yaml:13: there is no stream 'bath'; did you mean 'both'?"),
-        ("couple: both,", "couple: left,",
-         "toy.yaml:13: template 'scaled_twice' takes Couple as 'couple', but 'left' is Number"),
-        ("output: last", "output: lost",
-         "toy.yaml:6: the output 'lost' is no stream of 'scaled_twice'; did you mean 'last'?"),
-        ("    output: last\n", "", "toy.yaml:3: template 'scaled_twice' lacks 'output'"),
-        ("    inputs:", "    input:", "toy.yaml:4: template 'scaled_twice' has no 'input'; did you mean 'inputs'?"),
-        ("      first:", "      couple:", "toy.yaml:8: 'couple' is already an input of template 'scaled_twice'"),
-        ("factor: $second", "factor: 1 m",
-         "toy.yaml:5: the parameter 'second' of 'scaled_twice' is used nowhere; write $second"),
-        ("factor: $second", "factor: $secund, bad: [$second]",
-         "toy.yaml:9: template 'scaled_twice' has no parameter 'secund'; did you mean 'second'?"),
-        ("factor: $second", "factor: $secund",
-         "toy.yaml:9: template 'scaled_twice' has no parameter 'secund'; did you mean 'second'?"),
-        ("couple: first", "couple: $couple",
-         "toy.yaml:9: 'couple' is an input of template 'scaled_twice'; write it without $"),
-        ("inputs: {couple: Couple}", "inputs: {couple: Cuple}",
-         "toy.yaml:4: 'couple' has an unknown type, 'Cuple'; did you mean 'Couple'?"),
-        ("couple: first", "couple: frist",
-         "toy.yaml:9: the template has no stream or input 'frist'; did you mean 'first'? (template used at toy"),
-        ("couple: couple, factor", "couple: couple, faktor",
-         ("toy.yaml:8: tests.flow.toys.Scale has no input or parameter 'faktor'; did you mean 'factor'? "
-          "(template used at toy.yaml:13)")),
-        ("second: 3 m", "second: 3 s",
-         ("toy.yaml:5: tests.flow.toys.Scale.factor: '3 s' is a time; expected a length in cm or m "
-          "(template used at toy.yaml:13)")),
-        ("stretch: 25 cm", "stretch: 25 s", "toy.yaml:1: tests.flow.toys.Scale.factor: '25 s' is a time"),
-        ("out:  {", "out:  {use: tests.flow.toys.Scale, ", "toy.yaml:13: an entry has 'use' or 'template', not both"),
-        ("b: out/first", "b: out/frist", "toy.yaml:14: there is no stream 'out/frist'; did you mean 'out/first'?"),
-        ("templates:", "template:", "toy.yaml:2: a pipeline has no 'template'; did you mean 'templates'?"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("{template: scaled_twice", "{template: scald_twice",
+     "toy.yaml:13: there is no template 'scald_twice'; did you mean 'scaled_twice'?"),
+    ("{template: scaled_twice", "{template: mine.yaml",
+     "toy.yaml:13: there is no template 'mine.yaml'; write it under 'templates' of the pipeline file"),
+    ("couple: both, factor", "factor",
+     "toy.yaml:13: 'out' lacks its input 'couple' (template 'scaled_twice' needs it)"),
+    ("both, factor:", "both, faktor:",
+     "toy.yaml:13: template 'scaled_twice' has no input or parameter 'faktor'; did you mean 'factor'?"),
+    ("couple: both,", "couple: bath,", "toy.yaml:13: there is no stream 'bath'; did you mean 'both'?"),
+    ("couple: both,", "couple: left,",
+     "toy.yaml:13: template 'scaled_twice' takes Couple as 'couple', but 'left' is Number"),
+    ("output: last", "output: lost",
+     "toy.yaml:6: the output 'lost' is no stream of 'scaled_twice'; did you mean 'last'?"),
+    ("    output: last\n", "", "toy.yaml:3: template 'scaled_twice' lacks 'output'"),
+    ("    inputs:", "    input:", "toy.yaml:4: template 'scaled_twice' has no 'input'; did you mean 'inputs'?"),
+    ("      first:", "      couple:", "toy.yaml:8: 'couple' is already an input of template 'scaled_twice'"),
+    ("factor: $second", "factor: 1 m",
+     "toy.yaml:5: the parameter 'second' of 'scaled_twice' is used nowhere; write $second"),
+    ("factor: $second", "factor: $secund, bad: [$second]",
+     "toy.yaml:9: template 'scaled_twice' has no parameter 'secund'; did you mean 'second'?"),
+    ("factor: $second", "factor: $secund",
+     "toy.yaml:9: template 'scaled_twice' has no parameter 'secund'; did you mean 'second'?"),
+    ("couple: first", "couple: $couple",
+     "toy.yaml:9: 'couple' is an input of template 'scaled_twice'; write it without $"),
+    ("inputs: {couple: Couple}", "inputs: {couple: Cuple}",
+     "toy.yaml:4: 'couple' has an unknown type, 'Cuple'; did you mean 'Couple'?"),
+    ("couple: first", "couple: frist",
+     "toy.yaml:9: the template has no stream or input 'frist'; did you mean 'first'? (template used at toy"),
+    ("couple: couple, factor", "couple: couple, faktor",
+     ("toy.yaml:8: tests.flow.toys.Scale has no input or parameter 'faktor'; did you mean 'factor'? "
+      "(template used at toy.yaml:13)")),
+    ("second: 3 m", "second: 3 s",
+     ("toy.yaml:5: tests.flow.toys.Scale.factor: '3 s' is a time; expected a length in cm or m "
+      "(template used at toy.yaml:13)")),
+    ("stretch: 25 cm", "stretch: 25 s", "toy.yaml:1: tests.flow.toys.Scale.factor: '25 s' is a time"),
+    ("out:  {", "out:  {use: tests.flow.toys.Scale, ", "toy.yaml:13: an entry has 'use' or 'template', not both"),
+    ("b: out/first", "b: out/frist", "toy.yaml:14: there is no stream 'out/frist'; did you mean 'out/first'?"),
+    ("templates:", "template:", "toy.yaml:2: a pipeline has no 'template'; did you mean 'templates'?"),
+])  # fmt: skip
 def test_a_mistake_is_one_sentence_with_both_lines(tmp_path, old, new, message):
     assert old in TOY
     assert refusal(tmp_path, TOY.replace(old, new, 1)).startswith(message)
@@ -168,16 +162,13 @@ def test_a_template_that_uses_itself_is_refused(tmp_path):
     assert "template 'outer' uses itself: outer -> scaled_twice -> outer" in refusal(tmp_path, text)
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("out/frist.factor=1 m", "there is no stream 'out/frist'; did you mean 'out/first'?"),
-        ("out.secnd=1 m", "neither template 'scaled_twice' nor its output, tests.flow.toys.Scale, has 'secnd'; did"),
-        ("out.second=1 s", "tests.flow.toys.Scale.factor: '1 s' is a time"),
-        ("out/first.factor=1", "tests.flow.toys.Scale.factor: 1 needs a unit"),
-        ("out=1", "name the parameter of 'out', as in out.parameter=value"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("override", "message"), [
+    ("out/frist.factor=1 m", "there is no stream 'out/frist'; did you mean 'out/first'?"),
+    ("out.secnd=1 m", "neither template 'scaled_twice' nor its output, tests.flow.toys.Scale, has 'secnd'; did"),
+    ("out.second=1 s", "tests.flow.toys.Scale.factor: '1 s' is a time"),
+    ("out/first.factor=1", "tests.flow.toys.Scale.factor: 1 needs a unit"),
+    ("out=1", "name the parameter of 'out', as in out.parameter=value"),
+])  # fmt: skip
 def test_a_bad_setting_of_a_template_is_named(tmp_path, override, message):
     assert refusal(tmp_path, overrides=[override]).startswith(f"--set {override}: {message}")
 
@@ -208,24 +199,21 @@ def test_one_rover_reaches_every_stage_that_needs_it(name):
     assert {(rover.max_step, rover.wheel, rover.footprint) for rover in rovers} == {(0.4, 0.6, 1.0)}
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("rover.max_stp=1m", "stages.TerrainFeatures.rover has no parameter 'max_stp'; did you mean 'max_step'?"),
-        ("rover.max_step=1s", "stages.TerrainFeatures.rover.max_step: '1s' is a time; expected a length in cm or m"),
-        ("rover.wheel=1km", "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
-        ("rover=3", "stages.TerrainFeatures.rover: expected a mapping of footprint, wheel_track, wheel, max_step"),
-        ("McapSink.compresion=zstd", "recordings.McapSink has no parameter 'compresion'; did you mean 'compression'?"),
-        ("McapSink.compression=zip", "recordings.McapSink.compression: must be one of lz4, zstd, none, not zip"),
-        ("McapSnk.compression=zstd", "there is no stream 'McapSnk'; did you mean 'McapSink'?"),
-        ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
-        ("RerunSink.without=[cloud, clowd]", "no stream of the frames matches 'clowd'; did you mean 'cloud'?"),
-        ("RerunSink.without=[terrain/*]", "no stream of the frames matches 'terrain/*'"),
-        ("RerunSink.live_pipe=3", "recordings.RerunSink has no parameter 'live_pipe'; it has max_width, jpeg_quality"),
-        ("RerunSink.limits=[a=1]", "recordings.RerunSink has no parameter 'limits'; it has max_width, jpeg_quality"),
-        ("McapSink.inputs=[a.mcap]", "recordings.McapSink has no parameter 'inputs'; it has results, also"),
-    ],
-)
+@pytest.mark.parametrize(("override", "message"), [
+    ("rover.max_stp=1m", "stages.TerrainFeatures.rover has no parameter 'max_stp'; did you mean 'max_step'?"),
+    ("rover.max_step=1s", "stages.TerrainFeatures.rover.max_step: '1s' is a time; expected a length in cm or m"),
+    ("rover.wheel=1km", "stages.TerrainFeatures.rover.wheel: must be at most 5 m, not 1km"),
+    ("rover=3", "stages.TerrainFeatures.rover: expected a mapping of footprint, wheel_track, wheel, max_step"),
+    ("McapSink.compresion=zstd", "recordings.McapSink has no parameter 'compresion'; did you mean 'compression'?"),
+    ("McapSink.compression=zip", "recordings.McapSink.compression: must be one of lz4, zstd, none, not zip"),
+    ("McapSnk.compression=zstd", "there is no stream 'McapSnk'; did you mean 'McapSink'?"),
+    ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
+    ("RerunSink.without=[cloud, clowd]", "no stream of the frames matches 'clowd'; did you mean 'cloud'?"),
+    ("RerunSink.without=[terrain/*]", "no stream of the frames matches 'terrain/*'"),
+    ("RerunSink.live_pipe=3", "recordings.RerunSink has no parameter 'live_pipe'; it has max_width, jpeg_quality"),
+    ("RerunSink.limits=[a=1]", "recordings.RerunSink has no parameter 'limits'; it has max_width, jpeg_quality"),
+    ("McapSink.inputs=[a.mcap]", "recordings.McapSink has no parameter 'inputs'; it has results, also"),
+])  # fmt: skip
 def test_a_mistake_in_the_rover_or_a_sink_names_the_setting(override, message):
     with pytest.raises(PipelineError) as caught:
         load("rover", [override])

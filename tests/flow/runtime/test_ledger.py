@@ -30,16 +30,13 @@ def test_a_stage_error_of_a_called_library_is_shown_as_it_is():
     )
 
 
-@pytest.mark.parametrize(
-    ("call", "sentence"),
-    [
-        (lambda: np.zeros(3).reshape(2), "ValueError: cannot reshape array of size 3 into shape (2,)"),
-        (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError: Singular matrix"),  # raised in a file of NumPy's
-        (lambda: int("nix"), "ValueError: invalid literal for int() with base 10: 'nix'"),
-        (lambda: {}["left"], "KeyError: 'left'"),
-        (lambda: exec("raise OSError('two\\n lines')"), "OSError: two lines"),
-    ],
-)
+@pytest.mark.parametrize(("call", "sentence"), [
+    (lambda: np.zeros(3).reshape(2), "ValueError: cannot reshape array of size 3 into shape (2,)"),
+    (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError: Singular matrix"),  # raised in a file of NumPy's
+    (lambda: int("nix"), "ValueError: invalid literal for int() with base 10: 'nix'"),
+    (lambda: {}["left"], "KeyError: 'left'"),
+    (lambda: exec("raise OSError('two\\n lines')"), "OSError: two lines"),
+])  # fmt: skip
 def test_any_other_exception_is_named_with_the_stage_s_file_and_line(call, sentence):
     line = call.__code__.co_firstlineno
     assert sentence_of(call) == f"{sentence} (test_ledger.py, line {line}; --debug shows the traceback)"

@@ -112,16 +112,13 @@ def test_opencv_files_are_read_as_opencv_writes_them(tmp_path):
     assert (calibration.models[0].width, calibration.camera_from_imu) == (0, None)
 
 
-@pytest.mark.parametrize(
-    ("of_k", "of_d", "turn", "shift"),
-    [
-        ("K{n}", "D{n}", "R", "T"),
-        ("cameraMatrix{n}", "distCoeffs{n}", "rotation", "translation"),
-        ("camera_matrix_{n}", "dist_coeffs_{n}", "rotation_matrix", "translation_vector"),
-        ("{side}_camera_matrix", "{side}_distortion_coefficients", "R", "T"),
-        ("camera_matrix_{side}", "distortion_coefficients_{side}", "R", "T"),
-    ],
-)
+@pytest.mark.parametrize(("of_k", "of_d", "turn", "shift"), [
+    ("K{n}", "D{n}", "R", "T"),
+    ("cameraMatrix{n}", "distCoeffs{n}", "rotation", "translation"),
+    ("camera_matrix_{n}", "dist_coeffs_{n}", "rotation_matrix", "translation_vector"),
+    ("{side}_camera_matrix", "{side}_distortion_coefficients", "R", "T"),
+    ("camera_matrix_{side}", "distortion_coefficients_{side}", "R", "T"),
+])  # fmt: skip
 def test_opencv_files_may_have_the_names_of_other_tools(tmp_path, of_k, of_d, turn, shift):
     left_to_right = np.linalg.inv(RIGHT_IN_LEFT)
     content = {turn: left_to_right[:3, :3].tolist(), shift: left_to_right[:3, 3].tolist()}
@@ -185,25 +182,16 @@ def test_a_camchain_with_the_right_camera_first_is_read_by_its_topics(tmp_path):
         assert opened.resolution.cameras is not None
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (lambda cams: cams["cam1"].pop("intrinsics"), "cam1 of .* lacks 'intrinsics'"),
-        (lambda cams: cams["cam0"].update(intrinsics=[1, 2, 3]), "'intrinsics' of cam0 of .* is not 4 numbers"),
-        (lambda cams: cams["cam0"].update(camera_model="omni"), "camera model 'omni' of cam0"),
-        (lambda cams: cams["cam0"].update(distortion_model="fov"), "lens model 'fov' of cam0"),
-        (
-            lambda cams: cams["cam1"].update(T_cn_cnm1=[[1] * 4] * 4),
-            "'T_cn_cnm1' of cam1 .* is not a rotation",
-        ),
-        (
-            lambda cams: cams["cam1"]["T_cn_cnm1"][3].reverse(),
-            "the last row of 'T_cn_cnm1' of cam1 .* is .*, not 0, 0, 0",
-        ),
-        (lambda cams: cams["cam1"].update(T_cn_cnm1=rigid([0, 0, 0], [-110.0, 0, 0]).tolist()), "write it in metres"),
-        (lambda cams: cams.pop("cam1"), "is no calibration of a known format"),
-    ],
-)
+@pytest.mark.parametrize(("change", "sentence"), [
+    (lambda cams: cams["cam1"].pop("intrinsics"), "cam1 of .* lacks 'intrinsics'"),
+    (lambda cams: cams["cam0"].update(intrinsics=[1, 2, 3]), "'intrinsics' of cam0 of .* is not 4 numbers"),
+    (lambda cams: cams["cam0"].update(camera_model="omni"), "camera model 'omni' of cam0"),
+    (lambda cams: cams["cam0"].update(distortion_model="fov"), "lens model 'fov' of cam0"),
+    (lambda cams: cams["cam1"].update(T_cn_cnm1=[[1] * 4] * 4), "'T_cn_cnm1' of cam1 .* is not a rotation"),
+    (lambda cams: cams["cam1"]["T_cn_cnm1"][3].reverse(), "the last row of 'T_cn_cnm1' of cam1 .* is .*, not 0, 0, 0"),
+    (lambda cams: cams["cam1"].update(T_cn_cnm1=rigid([0, 0, 0], [-110.0, 0, 0]).tolist()), "write it in metres"),
+    (lambda cams: cams.pop("cam1"), "is no calibration of a known format"),
+])  # fmt: skip
 def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path, change, sentence):
     (path,) = kalibr(tmp_path)
     cams = yaml.safe_load(path.read_text())
@@ -216,11 +204,9 @@ def test_a_file_that_cannot_be_used_is_named_with_its_key(tmp_path, change, sent
 ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{n + 1}: &a{n + 1} [*a{n}, *a{n}]\n" for n in range(40))
 
 
-@pytest.mark.parametrize(
-    "content",
-    ["[1, 2", "- a", "", "!!python/object:os.system {}", "\x00", "!!timestamp x: 1", "a: &a [*a]", ALIASES],
-    ids=["cut", "list", "empty", "object", "zero", "no time", "contains itself", "aliases"],
-)
+@pytest.mark.parametrize("content", [
+    "[1, 2", "- a", "", "!!python/object:os.system {}", "\x00", "!!timestamp x: 1", "a: &a [*a]", ALIASES,
+], ids=["cut", "list", "empty", "object", "zero", "no time", "contains itself", "aliases"])  # fmt: skip
 def test_a_file_that_is_no_mapping_is_refused(tmp_path, content):
     (tmp_path / "file.yaml").write_text(content)
     with pytest.raises(LogError, match=r"the calibration .*file\.yaml"):

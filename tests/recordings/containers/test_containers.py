@@ -112,22 +112,19 @@ def test_the_advice_for_a_stopped_recorder_adds_its_messages(database, tmp_path,
     assert read(path) == (sound, [])
 
 
-@pytest.mark.parametrize(
-    ("statements", "sentence"),
-    [
-        (["DROP TABLE topics"], "is an SQLite file, but no rosbag2 recording: it has no table of messages"),
-        (
-            [
-                "CREATE TABLE other AS SELECT NULL AS id, name, type, serialization_format FROM topics",
-                "DROP TABLE topics",
-                "ALTER TABLE other RENAME TO topics",
-            ],
-            "is no rosbag2 recording or is damaged (int() argument must be",
-        ),
-        (["DELETE FROM messages"], "contains no messages; record it again"),
-        (["ALTER TABLE topics RENAME COLUMN type TO kind"], "is no rosbag2 recording or is damaged (no such column"),
-    ],
-)
+@pytest.mark.parametrize(("statements", "sentence"), [
+    (["DROP TABLE topics"], "is an SQLite file, but no rosbag2 recording: it has no table of messages"),
+    (
+        [
+            "CREATE TABLE other AS SELECT NULL AS id, name, type, serialization_format FROM topics",
+            "DROP TABLE topics",
+            "ALTER TABLE other RENAME TO topics",
+        ],
+        "is no rosbag2 recording or is damaged (int() argument must be",
+    ),
+    (["DELETE FROM messages"], "contains no messages; record it again"),
+    (["ALTER TABLE topics RENAME COLUMN type TO kind"], "is no rosbag2 recording or is damaged (no such column"),
+])  # fmt: skip
 def test_a_database_without_messages_is_refused(database, statements, sentence):
     edit(database, *statements)
     with pytest.raises(LogError) as refused:

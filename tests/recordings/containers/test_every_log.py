@@ -78,13 +78,10 @@ def test_every_log_is_read_to_the_messages_that_another_reader_finds(folder, pat
         assert sorted(read) == wanted, path
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("ros1/no-messages.bag", "contains no messages; record it again"),
-        ("rosbag2/mcap-wbag/metadata.yaml", "only describes a recording; give its folder"),
-    ],
-)
+@pytest.mark.parametrize(("name", "sentence"), [
+    ("ros1/no-messages.bag", "contains no messages; record it again"),
+    ("rosbag2/mcap-wbag/metadata.yaml", "only describes a recording; give its folder"),
+])  # fmt: skip
 def test_what_is_no_log_is_refused_in_a_sentence(name, sentence):
     path = data_folder("logs") / name
     with pytest.raises(LogError) as refused:

@@ -112,15 +112,12 @@ def test_a_clock_set_back_between_files_is_found(sample, whole, tmp_path):
     assert read(folder) == essences(whole)
 
 
-@pytest.mark.parametrize(
-    ("names", "sentence"),
-    [
-        ([], "contains no recording (no .mcap, .db3, .bag file); give a log or its folder"),
-        (["notes.txt"], "contains no recording (no .mcap, .db3, .bag file); give a log or its folder"),
-        (["one/metadata.yaml"], "contains no recording (no .mcap, .db3, .bag file); its folders one are recordings"),
-        (["a.mcap", "b_1.mcap"], "contains several recordings (a.mcap, b_1.mcap); give the files of one"),
-    ],
-)
+@pytest.mark.parametrize(("names", "sentence"), [
+    ([], "contains no recording (no .mcap, .db3, .bag file); give a log or its folder"),
+    (["notes.txt"], "contains no recording (no .mcap, .db3, .bag file); give a log or its folder"),
+    (["one/metadata.yaml"], "contains no recording (no .mcap, .db3, .bag file); its folders one are recordings"),
+    (["a.mcap", "b_1.mcap"], "contains several recordings (a.mcap, b_1.mcap); give the files of one"),
+])  # fmt: skip
 def test_a_folder_without_one_recording_is_refused(tmp_path, names, sentence):
     for name in names:
         (tmp_path / name).parent.mkdir(exist_ok=True)

@@ -125,17 +125,11 @@ def moving(path: Path, *links: tuple[str, str], count: int = 5) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("links", "sentence"),
-    [
-        ([WHEEL], "no transform places 'base_link' (they place 'wheel'); set 'base_frame' of the source"),
-        ([ODOM, ("map", "base_link")], "'base_link' has two parents, 'map' and 'odom'; record"),
-        (
-            [("odom", "foot"), ("foot", "base_link")],
-            "'base_link' is placed in 'foot', and that in 'odom'; set 'base_fr",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("links", "sentence"), [
+    ([WHEEL], "no transform places 'base_link' (they place 'wheel'); set 'base_frame' of the source"),
+    ([ODOM, ("map", "base_link")], "'base_link' has two parents, 'map' and 'odom'; record"),
+    ([("odom", "foot"), ("foot", "base_link")], "'base_link' is placed in 'foot', and that in 'odom'; set 'base_fr"),
+])  # fmt: skip
 def test_transforms_with_no_pose_or_two_are_refused(tmp_path, links, sentence):
     with McapSource(odometry="/tf").open(moving(tmp_path / "log.mcap", *links)) as log:
         assert f"the source's 'odometry' is set to /tf, where {sentence}" in log.refused["odometry"]

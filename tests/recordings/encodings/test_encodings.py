@@ -107,22 +107,19 @@ def test_an_absent_field_of_json_is_refused_with_those_that_are_there():
         AngleField("nod", "deg", 1)(SimpleNamespace(pitch=1.0, roll=2.0))
 
 
-@pytest.mark.parametrize(
-    "data",
-    [b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000],
-    ids=["empty", "list", "cut", "other type", "deep", "large"],
-)
+@pytest.mark.parametrize("data", [
+    b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000,
+], ids=["empty", "list", "cut", "other type", "deep", "large"])  # fmt: skip
 def test_foreign_json_is_an_error_in_one_sentence(data):
     _, decode = decoder_of(Channel(1, "/image", "json", MessageSchema("foxglove.RawImage", "jsonschema", b"")))
     with pytest.raises((LogError, AttributeError)):
         decode(data)
 
 
-@pytest.mark.parametrize(
-    ("frame", "seconds", "sentence"),
-    [(r"\ud800", 1, "it is not JSON"), ("a", 1 << 40, "its timestamp is damaged")],
-    ids=["half a character", "large seconds"],
-)
+@pytest.mark.parametrize(("frame", "seconds", "sentence"), [
+    (r"\ud800", 1, "it is not JSON"),
+    ("a", 1 << 40, "its timestamp is damaged"),
+], ids=["half a character", "large seconds"])  # fmt: skip
 def test_json_values_that_no_result_could_contain_are_refused(frame, seconds, sentence):
     _, decode = decoder_of(Channel(1, "/tf", "json", MessageSchema("foxglove.FrameTransforms", "jsonschema", b"")))
     zero = dict.fromkeys("xyz", 0.0)
@@ -132,32 +129,24 @@ def test_json_values_that_no_result_could_contain_are_refused(frame, seconds, se
         decode(json.dumps({"transforms": [transform]}).replace("FRAME", frame).encode())
 
 
-@pytest.mark.parametrize(
-    ("encoding", "schema", "sentence"),
-    [
-        ("protobuf", MessageSchema("a.B", "protobuf", b"\xff\xff"), "schema 'a.B' cannot be used"),
-        ("protobuf", MessageSchema("a.B", "jsonschema", b"{}"), "is in 'jsonschema', not in 'protobuf'"),
-        ("ros1", MessageSchema("a/B", "ros1msg", b"Nothing nothing"), "schema 'a/B' cannot be parsed"),
-        (
-            "ros1",
-            MessageSchema("a/B", "ros1msg", NOTHING.format("").encode()),
-            "a list of c/msg/E, which has no fields",
-        ),
-        ("ros1", MessageSchema("a/B", "ros1msg", NOTHING.format(2000).encode()), "a/msg/B.x has 2000 elements"),
-        ("cdr", MessageSchema("a/B", "ros2msg", b"string[2000] x"), "a/msg/B.x has 2000 elements"),
-        ("ros1", None, "its messages have no schema"),
-        ("cdr", MessageSchema("a/B", "ros2msg", b"int32 x\n" * 2000), "a definition has more than 1000 lines"),
-    ],
-)
+@pytest.mark.parametrize(("encoding", "schema", "sentence"), [
+    ("protobuf", MessageSchema("a.B", "protobuf", b"\xff\xff"), "schema 'a.B' cannot be used"),
+    ("protobuf", MessageSchema("a.B", "jsonschema", b"{}"), "is in 'jsonschema', not in 'protobuf'"),
+    ("ros1", MessageSchema("a/B", "ros1msg", b"Nothing nothing"), "schema 'a/B' cannot be parsed"),
+    ("ros1", MessageSchema("a/B", "ros1msg", NOTHING.format("").encode()), "a list of c/msg/E, which has no fields"),
+    ("ros1", MessageSchema("a/B", "ros1msg", NOTHING.format(2000).encode()), "a/msg/B.x has 2000 elements"),
+    ("cdr", MessageSchema("a/B", "ros2msg", b"string[2000] x"), "a/msg/B.x has 2000 elements"),
+    ("ros1", None, "its messages have no schema"),
+    ("cdr", MessageSchema("a/B", "ros2msg", b"int32 x\n" * 2000), "a definition has more than 1000 lines"),
+])  # fmt: skip
 def test_a_schema_that_cannot_be_used_is_refused(encoding, schema, sentence):
     with pytest.raises(LogError, match=sentence):
         decoder_of(Channel(1, "/topic", encoding, schema))
 
 
-@pytest.mark.parametrize(
-    ("encoding", "step", "place"),
-    [("uyvy", 12, 1), ("yuv422", 12, 1), ("yuyv", 12, 0), ("yuv422_yuy2", 12, 0), ("nv12", 6, 0)],
-)
+@pytest.mark.parametrize(("encoding", "step", "place"), [
+    ("uyvy", 12, 1), ("yuv422", 12, 1), ("yuyv", 12, 0), ("yuv422_yuy2", 12, 0), ("nv12", 6, 0),
+])  # fmt: skip
 def test_the_brightness_of_yuv_images_is_read(encoding, step, place):
     luma = np.random.default_rng(1).integers(0, 256, (4, 6), np.uint8)
     packed = np.full((4 if step == 12 else 6, step), 128, np.uint8)  # nv12 has the colours in rows below

@@ -82,25 +82,20 @@ def test_the_camera_has_the_given_attitude(tmp_path, pitch_down, roll):
     )
 
 
-@pytest.mark.parametrize(
-    ("names", "left"),
-    [
-        (["a-left.png", "a-right.png", "b-left.png", "b-right.png"], ["a-left.png", "b-left.png"]),
-        (["left/10.png", "left/9.png", "right/10.png", "right/9.png"], ["left/9.png", "left/10.png"]),
-        (["im0.png", "im1.png", "mask0nocc.png"], ["im0.png"]),
-        (["img_cam0_9m.png", "img_cam1_9m.png"], ["img_cam0_9m.png"]),
-        (["L_01.png", "L_02.png", "R_01.png", "R_02.png"], ["L_01.png", "L_02.png"]),
-        (["left/L_1.png", "right/R_1.png"], ["left/L_1.png"]),
-        (
-            ["image_2/0_10.png", "image_2/1_10.png", "image_3/0_10.png", "image_3/1_10.png", "disp_occ_0/0_10.png"],
-            ["image_2/0_10.png", "image_2/1_10.png"],
-        ),
-        (["image_02/1.png", "image_03/1.png"], ["image_02/1.png"]),
-        (["cam0/0.png", "cam0/1.png", "cam1/0.png", "cam1/1.png"], ["cam0/0.png", "cam0/1.png"]),
-        (["0_cam0.png", "1_cam0.png", "0_cam1.png", "1_cam1.png"], ["0_cam0.png", "1_cam0.png"]),
-        (["cam_0/cam0_0.png", "cam_1/cam1_0.png"], ["cam_0/cam0_0.png"]),
-    ],
-)
+@pytest.mark.parametrize(("names", "left"), [
+    (["a-left.png", "a-right.png", "b-left.png", "b-right.png"], ["a-left.png", "b-left.png"]),
+    (["left/10.png", "left/9.png", "right/10.png", "right/9.png"], ["left/9.png", "left/10.png"]),
+    (["im0.png", "im1.png", "mask0nocc.png"], ["im0.png"]),
+    (["img_cam0_9m.png", "img_cam1_9m.png"], ["img_cam0_9m.png"]),
+    (["L_01.png", "L_02.png", "R_01.png", "R_02.png"], ["L_01.png", "L_02.png"]),
+    (["left/L_1.png", "right/R_1.png"], ["left/L_1.png"]),
+    (["image_2/0_10.png", "image_2/1_10.png", "image_3/0_10.png", "image_3/1_10.png", "disp_occ_0/0_10.png"],
+     ["image_2/0_10.png", "image_2/1_10.png"]),
+    (["image_02/1.png", "image_03/1.png"], ["image_02/1.png"]),
+    (["cam0/0.png", "cam0/1.png", "cam1/0.png", "cam1/1.png"], ["cam0/0.png", "cam0/1.png"]),
+    (["0_cam0.png", "1_cam0.png", "0_cam1.png", "1_cam1.png"], ["0_cam0.png", "1_cam0.png"]),
+    (["cam_0/cam0_0.png", "cam_1/cam1_0.png"], ["cam_0/cam0_0.png"]),
+])  # fmt: skip
 def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
     for name in names:
         save(tmp_path / name, picture(0))
@@ -110,18 +105,15 @@ def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
     assert not set(found[0]) & set(found[1])
 
 
-@pytest.mark.parametrize(
-    ("names", "sentence"),
-    [
-        (["a-left.png", "a-right.png", "b-right.png", "c.png"], r"b-right\.png, c\.png has no partner"),
-        (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
-        ([], "contains no image pairs, only 0 images"),
-        (["0.png", "1.png", "2.png", "3.png"], r"contains no image pairs, only 4 images"),
-        (["0/0.png", "0/1.png", "1/0.png", "1/1.png"], r"contains no image pairs, only 4 images"),
-        (["im0.png", "im1.png", "view5.png"], r"view5\.png has no partner"),
-        (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
-    ],
-)
+@pytest.mark.parametrize(("names", "sentence"), [
+    (["a-left.png", "a-right.png", "b-right.png", "c.png"], r"b-right\.png, c\.png has no partner"),
+    (["a_l.png", "a_r.png", "b_l.png"], r"b_l\.png has no partner"),
+    ([], "contains no image pairs, only 0 images"),
+    (["0.png", "1.png", "2.png", "3.png"], r"contains no image pairs, only 4 images"),
+    (["0/0.png", "0/1.png", "1/0.png", "1/1.png"], r"contains no image pairs, only 4 images"),
+    (["im0.png", "im1.png", "view5.png"], r"view5\.png has no partner"),
+    (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
+])  # fmt: skip
 def test_no_image_is_left_out_silently(tmp_path, names, sentence):
     for name in names:
         save(tmp_path / name, picture(0))
@@ -129,19 +121,16 @@ def test_no_image_is_left_out_silently(tmp_path, names, sentence):
         pair_images(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"baseline": None}, "lacks 'baseline'"),
-        ({"focal": 3.0}, "has the unknown 'focal'"),
-        ({"fx": "wide"}, r": fx must be a number in px, not 'wide'"),
-        ({"fx": 10**400}, r": fx must be a finite number in px"),
-        ({"fx": 10**30}, r": fx must be at most 1e\+09 px, not 1e\+30 px"),
-        ({"baseline": -0.2}, r": baseline must be at least .* not -20 cm"),
-        ({"cx": 24.5}, "the calibration's centre .cx 24.5, cy 7.5. is outside"),
-        ({"width": 640}, "is 24x16, but the calibration is for 640x16"),
-    ],
-)
+@pytest.mark.parametrize(("change", "sentence"), [
+    ({"baseline": None}, "lacks 'baseline'"),
+    ({"focal": 3.0}, "has the unknown 'focal'"),
+    ({"fx": "wide"}, r": fx must be a number in px, not 'wide'"),
+    ({"fx": 10**400}, r": fx must be a finite number in px"),
+    ({"fx": 10**30}, r": fx must be at most 1e\+09 px, not 1e\+30 px"),
+    ({"baseline": -0.2}, r": baseline must be at least .* not -20 cm"),
+    ({"cx": 24.5}, "the calibration's centre .cx 24.5, cy 7.5. is outside"),
+    ({"width": 640}, "is 24x16, but the calibration is for 640x16"),
+])  # fmt: skip
 def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path, change, sentence):
     left, right = make_pairs(tmp_path, 1)
     calibration = {k: v for k, v in {**CALIBRATION, "height": 16, **change}.items() if v is not None}
@@ -150,15 +139,12 @@ def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path, change, sen
     assert not list(tmp_path.glob("out*"))
 
 
-@pytest.mark.parametrize(
-    ("option", "values", "sentence"),
-    [
-        ("pitch_down", (91, np.nan), "are impossible"),
-        ("roll", (181,), "are impossible"),
-        ("height", (0.0, np.inf, np.nan), "height .*must be"),
-        ("rate", (0.0, np.inf, np.nan, 1e-12, 1e10), "rate .*must be"),
-    ],
-)
+@pytest.mark.parametrize(("option", "values", "sentence"), [
+    ("pitch_down", (91, np.nan), "are impossible"),
+    ("roll", (181,), "are impossible"),
+    ("height", (0.0, np.inf, np.nan), "height .*must be"),
+    ("rate", (0.0, np.inf, np.nan, 1e-12, 1e10), "rate .*must be"),
+])  # fmt: skip
 def test_an_impossible_attitude_height_or_rate_is_refused(tmp_path, option, values, sentence):
     left, right = make_pairs(tmp_path, 1)
     for value in values:
@@ -291,18 +277,14 @@ def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
         np.testing.assert_allclose(frame.mount.translation, [0, 0, 0.9])
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("name,pitch\n0-left,3\n", "has the unknown column 'pitch'; its first line must name"),
-        ("name,roll\n0-left,3\n", "has the columns name, roll; its first line must name"),
-        ("name,pitch_down\n1-left,3\n", "has no row for 0-left.png"),
-        ("name,pitch_down,roll\n0-left,3\n", "line 2 has 2 columns, but the first line names 3"),
-        ("name,pitch_down\n0-left,down\n", "line 2 contains what is no number"),
-        ("name,pitch_down\n0-left,200\n", "line 2: pitch_down must be at most 180 deg"),
-    ],
-    ids=range(6),
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ("name,pitch\n0-left,3\n", "has the unknown column 'pitch'; its first line must name"),
+    ("name,roll\n0-left,3\n", "has the columns name, roll; its first line must name"),
+    ("name,pitch_down\n1-left,3\n", "has no row for 0-left.png"),
+    ("name,pitch_down,roll\n0-left,3\n", "line 2 has 2 columns, but the first line names 3"),
+    ("name,pitch_down\n0-left,down\n", "line 2 contains what is no number"),
+    ("name,pitch_down\n0-left,200\n", "line 2: pitch_down must be at most 180 deg"),
+], ids=range(6))  # fmt: skip
 def test_attitudes_that_are_none_are_refused(tmp_path, text, words):
     left, right = make_pairs(tmp_path, 1)
     (tmp_path / "attitudes.csv").write_text(text)

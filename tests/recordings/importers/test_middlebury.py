@@ -88,14 +88,11 @@ def test_either_name_of_the_truth_is_read(tmp_path):
     np.testing.assert_array_equal(np.isfinite(read_scene(scene).truth), np.isfinite(scenes.true_disparity()))
 
 
-@pytest.mark.parametrize(
-    ("without", "topics", "words"),
-    [
-        (("disp0GT.pfm",), set(), "without truth (no disp0GT.pfm or disp0.pfm)"),
-        (("disp0GT.pfm", "mask0nocc.png"), set(), "without truth"),
-        (("mask0nocc.png",), {"/truth/disparity"}, "without occlusions (no mask0nocc.png)"),
-    ],
-)
+@pytest.mark.parametrize(("without", "topics", "words"), [
+    (("disp0GT.pfm",), set(), "without truth (no disp0GT.pfm or disp0.pfm)"),
+    (("disp0GT.pfm", "mask0nocc.png"), set(), "without truth"),
+    (("mask0nocc.png",), {"/truth/disparity"}, "without occlusions (no mask0nocc.png)"),
+])  # fmt: skip
 def test_a_scene_without_truth_is_reported(tmp_path, without, topics, words):
     log, sentence = imported(write_scene(tmp_path / "Box", without))
     assert set(truth_of(log)) == topics
@@ -119,41 +116,31 @@ def calibrate(**changes: object):
     return lambda folder: (folder / "calib.txt").write_text(scenes.calibration(**changes))
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (lambda folder: (folder / "im1.png").unlink(), r"cannot read .*im1\.png: No such file"),
-        (lambda folder: (folder / "calib.txt").unlink(), r"Box has no calib\.txt; give the folder of one scene"),
-        (spoil("im0.png", b"no picture"), r"im0\.png is not a readable image"),
-        (spoil("calib.txt", b"\xff\xfe\x00"), r"calib\.txt is not a text file"),
-        (calibrate(doffs=None), r"calib\.txt lacks 'doffs'"),
-        (calibrate(ndisp="many"), r"calib\.txt has an entry that is not a number or matrix .*many"),
-        (calibrate(cam0="[1 2]"), r"calib\.txt has an entry that is not a number or matrix"),
-        (calibrate(cam0="[-9 0 1; 0 9 1; 0 0 1]"), r"calib\.txt: fx is -9"),
-        (calibrate(baseline=0), r"calib\.txt: baseline is 0"),
-        (calibrate(ndisp="nan"), r"calib\.txt: ndisp is nan"),
-        (calibrate(doffs=0), r"calib\.txt: doffs is 0, but 12\.5"),
-        (
-            spoil("disp0GT.pfm", b"Pf\n96 64\n-1\n" + 96 * 64 * b"\0\0\x80\x7f"),
-            r"disp0GT\.pfm has no known pixel",
-        ),
-        (calibrate(width=48), r"im0\.png is 96x64, but the calibration is for 48x64"),
-        (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
-        (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),
-        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels, but 3x2 pixels need 24"),
-        (spoil("disp0GT.pfm", b"Pf\n3 2\n1e\n" + bytes(24)), r"its scale 1e is not a number"),
-        (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(24)), r"disp0GT\.pfm is 3x2, but the images are 96x64"),
-        (spoil("mask0nocc.png", b""), r"mask0nocc\.png is not a readable image"),
-        (
-            lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.full((64, 96), 77, np.uint8)),
-            r"mask0nocc\.png has a pixel of 77; an occlusion mask has only 255, 128 and 0",
-        ),
-        (
-            lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.zeros((32, 48), np.uint8)),
-            r"mask0nocc\.png is 48x32, but the images are 96x64",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("damage", "words"), [
+    (lambda folder: (folder / "im1.png").unlink(), r"cannot read .*im1\.png: No such file"),
+    (lambda folder: (folder / "calib.txt").unlink(), r"Box has no calib\.txt; give the folder of one scene"),
+    (spoil("im0.png", b"no picture"), r"im0\.png is not a readable image"),
+    (spoil("calib.txt", b"\xff\xfe\x00"), r"calib\.txt is not a text file"),
+    (calibrate(doffs=None), r"calib\.txt lacks 'doffs'"),
+    (calibrate(ndisp="many"), r"calib\.txt has an entry that is not a number or matrix .*many"),
+    (calibrate(cam0="[1 2]"), r"calib\.txt has an entry that is not a number or matrix"),
+    (calibrate(cam0="[-9 0 1; 0 9 1; 0 0 1]"), r"calib\.txt: fx is -9"),
+    (calibrate(baseline=0), r"calib\.txt: baseline is 0"),
+    (calibrate(ndisp="nan"), r"calib\.txt: ndisp is nan"),
+    (calibrate(doffs=0), r"calib\.txt: doffs is 0, but 12\.5"),
+    (spoil("disp0GT.pfm", b"Pf\n96 64\n-1\n" + 96 * 64 * b"\0\0\x80\x7f"), r"disp0GT\.pfm has no known pixel"),
+    (calibrate(width=48), r"im0\.png is 96x64, but the calibration is for 48x64"),
+    (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
+    (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),
+    (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels, but 3x2 pixels need 24"),
+    (spoil("disp0GT.pfm", b"Pf\n3 2\n1e\n" + bytes(24)), r"its scale 1e is not a number"),
+    (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(24)), r"disp0GT\.pfm is 3x2, but the images are 96x64"),
+    (spoil("mask0nocc.png", b""), r"mask0nocc\.png is not a readable image"),
+    (lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.full((64, 96), 77, np.uint8)),
+     r"mask0nocc\.png has a pixel of 77; an occlusion mask has only 255, 128 and 0"),
+    (lambda folder: cv2.imwrite(str(folder / "mask0nocc.png"), np.zeros((32, 48), np.uint8)),
+     r"mask0nocc\.png is 48x32, but the images are 96x64"),
+])  # fmt: skip
 def test_a_damaged_scene_is_refused_and_leaves_no_log(tmp_path, damage, words):
     folder = write_scene(tmp_path / "Box")
     damage(folder)

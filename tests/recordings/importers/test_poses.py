@@ -94,19 +94,15 @@ def test_a_scene_of_lusnar_is_the_simulators_log(tmp_path):
     assert_same(tmp_path / "log.mcap", own)
 
 
-@pytest.mark.parametrize(
-    ("rig", "words"),
-    [
-        (RIG, "lacks 'body_axes' (axes of the data set's body"),
-        ("height: 0.9\n", "'height': 0.9 needs a unit; write 0.9 cm or 0.9 m"),
-        ("height: 0.9 m\n", "lacks 'pitch_down'"),
-        ("hight: 0.9 m\n", "has the entry 'hight', which is not used; it may have height, pitch_down"),
-        ("pitch_sign: 1\n", "has the entry 'pitch_sign', which is not used"),
-        (RIG + "body_axes: lfu\nworld_up: z\n", "are not three right-handed axes"),
-        (RIG + "body_axes: flu\nworld_up: up\n", "'world_up': must be one of z, -z, y, -y, not up"),
-    ],
-    ids=range(7),
-)
+@pytest.mark.parametrize(("rig", "words"), [
+    (RIG, "lacks 'body_axes' (axes of the data set's body"),
+    ("height: 0.9\n", "'height': 0.9 needs a unit; write 0.9 cm or 0.9 m"),
+    ("height: 0.9 m\n", "lacks 'pitch_down'"),
+    ("hight: 0.9 m\n", "has the entry 'hight', which is not used; it may have height, pitch_down"),
+    ("pitch_sign: 1\n", "has the entry 'pitch_sign', which is not used"),
+    (RIG + "body_axes: lfu\nworld_up: z\n", "are not three right-handed axes"),
+    (RIG + "body_axes: flu\nworld_up: up\n", "'world_up': must be one of z, -z, y, -y, not up"),
+], ids=range(7))  # fmt: skip
 def test_a_rig_file_that_says_too_little_is_refused(tmp_path, refused, rig, words):
     folder = write_lusnar(replace(EXACT, frames=1), tmp_path / "Moon_1")
     (tmp_path / "rig.yaml").write_text(rig)

@@ -18,21 +18,18 @@ def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize(
-    ("changes", "largest", "first"),
-    [
-        ({}, 0.2, 0.12),
-        *slow(
-            ({"rest": 0, "gyroscope_bias": 0.05}, 0.5, 0.85),
-            ({"rest": 0}, 0.3, 0.55),
-            ({"speed": 1.5}, 0.32, 0.12),
-            ({"vibration": 2.0}, 0.37, 0.12),
-            ({"rate": 400, "accelerometer_bias": 0.03}, 0.35, 0.45),
-            ({"gravity": 3.71}, 0.45, 0.14),
-            ({"gravity": 1.62}, 0.75, 0.18),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("changes", "largest", "first"), [
+    ({}, 0.2, 0.12),
+    *slow(
+        ({"rest": 0, "gyroscope_bias": 0.05}, 0.5, 0.85),
+        ({"rest": 0}, 0.3, 0.55),
+        ({"speed": 1.5}, 0.32, 0.12),
+        ({"vibration": 2.0}, 0.37, 0.12),
+        ({"rate": 400, "accelerometer_bias": 0.03}, 0.35, 0.45),
+        ({"gravity": 3.71}, 0.45, 0.14),
+        ({"gravity": 1.62}, 0.75, 0.18),
+    ),
+])  # fmt: skip
 def test_up_is_right_at_rest_and_while_driving(changes, largest, first):
     errors, judged = [], []
     for seed in (1, 2, 3):

@@ -147,26 +147,23 @@ def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
     assert f"doubtful: {doubt}" in format_description(inventory_of(path))
 
 
-@pytest.mark.parametrize(
-    ("errors", "told_by_transform", "note"),
-    [
-        (BASELINE, BASELINE * 1.04, ""),
+@pytest.mark.parametrize(("errors", "told_by_transform", "note"), [
+    (BASELINE, BASELINE * 1.04, ""),
+    (
+        BASELINE, BASELINE * 1.06,
         (
-            BASELINE, BASELINE * 1.06,
-            (
-                "the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by the static transform "
-                "'left_optical' <- 'right_optical'; correct the wrong one"
-            ),
+            "the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by the static transform "
+            "'left_optical' <- 'right_optical'; correct the wrong one"
         ),
+    ),
+    (
+        0.0, 0.3,
         (
-            0.0, 0.3,
-            (
-                "the baseline of 0.3 m comes from the static transform 'left_optical' <- 'right_optical', because "
-                "P[0,3] of both CameraInfo is 0"
-            ),
+            "the baseline of 0.3 m comes from the static transform 'left_optical' <- 'right_optical', because "
+            "P[0,3] of both CameraInfo is 0"
         ),
-    ],
-)  # fmt: skip
+    ),
+])  # fmt: skip
 def test_a_baseline_from_or_against_the_transform_is_noted(tmp_path, errors, told_by_transform, note):
     beside = Transform("left_optical", "right_optical", np.eye(3), [told_by_transform, 0, 0])
     by_p = changed("right/camera_info", {"p": lambda p: np.where(np.arange(12) == 3, -20 * errors, p)})

@@ -256,16 +256,13 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample, tmp_path):
     assert good > len([item for item in items if not isinstance(item, LostMessage)]) > good / 2
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        (b"", "is empty"),
-        (b"hello, I am a text file\n", "is not an MCAP log"),
-        (b"#ROSBAG V2.0\n....", "cannot be read"),
-        (b"SQLite format 3\0....", "is no rosbag2 recording or is damaged"),
-        (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
-    ],
-)
+@pytest.mark.parametrize(("content", "sentence"), [
+    (b"", "is empty"),
+    (b"hello, I am a text file\n", "is not an MCAP log"),
+    (b"#ROSBAG V2.0\n....", "cannot be read"),
+    (b"SQLite format 3\0....", "is no rosbag2 recording or is damaged"),
+    (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
+])  # fmt: skip
 def test_a_file_of_another_format_is_refused_by_its_name(tmp_path, content, sentence):
     path = tmp_path / "log.mcap"
     path.write_bytes(content)

@@ -68,10 +68,9 @@ def test_a_chunk_that_states_more_than_the_file_has_is_refused_before_decoding(m
 
 
 @pytest.mark.parametrize("padding", [0, 5])
-@pytest.mark.parametrize(
-    ("encoding", "order"),
-    [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("8UC3", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])],
-)
+@pytest.mark.parametrize(("encoding", "order"), [
+    ("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("8UC3", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0]),
+])  # fmt: skip
 def test_every_colour_order_is_read_as_rgb(encoding, order, padding):
     rgb = picture(7)
     rows = np.pad(rgb[:, :, order].reshape(HEIGHT, -1), ((0, 0), (0, padding)), constant_values=99)

@@ -31,10 +31,9 @@ def test_lengths_become_the_nearest_multiples_of_the_step(values, step):
     np.testing.assert_array_equal(known, np.rint(known))
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [("elevation", 581 / 1024), ("slope", 73 / 128), ("last", 0.5678), ("count", 0.5678), ("my_cost", 0.5678)],
-)
+@pytest.mark.parametrize(("name", "expected"), [
+    ("elevation", 581 / 1024), ("slope", 73 / 128), ("last", 0.5678), ("count", 0.5678), ("my_cost", 0.5678),
+])  # fmt: skip
 def test_layers_are_rounded_by_what_they_contain(name, expected):
     values = np.float32([0.5678, np.nan])
     found = rounded_layer(name, values, 1 / 1024, 0.01)

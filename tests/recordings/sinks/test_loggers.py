@@ -112,10 +112,9 @@ def test_the_same_pixels_are_stored_once(rrd, tmp_path):
     assert {"/stereo/left", "/rectified/left"} <= entities(record_of(tmp_path / "raw.rrd", [Record(START, items)]))
 
 
-@pytest.mark.parametrize(
-    ("camera_width", "max_width", "widths"),
-    [(1280, 0, (640, 240)), (640, 0, (320, 120)), (64, 0, (320, 120)), (1280, 1280, (1280, 480))],
-)
+@pytest.mark.parametrize(("camera_width", "max_width", "widths"), [
+    (1280, 0, (640, 240)), (640, 0, (320, 120)), (64, 0, (320, 120)), (1280, 1280, (1280, 480)),
+])  # fmt: skip
 def test_pictures_follow_the_size_of_the_images_unless_a_width_is_set(camera_width, max_width, widths):
     camera = StereoCamera(80, 80, 31.5, 23.5, 0.2, camera_width, 48)
     canvas = Canvas(None, jpeg_quality=75, max_width=max_width, camera=camera)

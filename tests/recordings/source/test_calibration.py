@@ -52,16 +52,10 @@ def test_parallel_cameras_need_no_rectification(tmp_path, names):
         assert log.resolution.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
 
 
-@pytest.mark.parametrize(
-    ("rotation", "place", "fx"),
-    [
-        (turned("y", -3), [0.25, 0, 0], 20.0),
-        (turned("z", 5), [0.25, 0, 0], 20.0),
-        (np.eye(3), [0.25, 0.01, 0], 20.0),
-        (np.eye(3), [0.25, 0, 0.1], 20.0),
-        (np.eye(3), [0.25, 0, 0], 22.0),
-    ],
-)
+@pytest.mark.parametrize(("rotation", "place", "fx"), [
+    (turned("y", -3), [0.25, 0, 0], 20.0), (turned("z", 5), [0.25, 0, 0], 20.0), (np.eye(3), [0.25, 0.01, 0], 20.0),
+    (np.eye(3), [0.25, 0, 0.1], 20.0), (np.eye(3), [0.25, 0, 0], 22.0),
+])  # fmt: skip
 def test_cameras_that_are_not_parallel_need_rectification(tmp_path, rotation, place, fx):
     beside = Transform("left_optical", "right_optical", rotation, place)
     with McapSource().open(single_calibrations(tmp_path / "raw.mcap", RAW, beside, fx)) as log:
@@ -90,34 +84,28 @@ def test_a_right_camera_not_beside_the_left_or_exchanged_with_it_is_refused(tmp_
         assert why in log.missing["left"]
 
 
-@pytest.mark.parametrize(
-    ("values", "sentence"),
-    [
-        ({"k": np.full(9, np.nan)}, "must be finite"),
-        ({"d": np.full(5, np.nan)}, "must be finite"),
-        ({"p": np.full(12, np.nan)}, "must be finite"),
-        ({"p": np.hstack([np.diag([0.0, 20, 1]), np.zeros((3, 1))]).reshape(-1)}, "focal lengths in P .* not positive"),
-        ({"r": np.diag([1.0, 1.0, 0.5]).reshape(-1)}, "R of the CameraInfo of .* is not a rotation"),
-        ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
-        ({"height": 7}, "lies outside its 24x7 images"),
-        ({"width": 0}, "is for images of 0x16"),
-        ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are impossible for a camera"),
-    ],
-)
+@pytest.mark.parametrize(("values", "sentence"), [
+    ({"k": np.full(9, np.nan)}, "must be finite"),
+    ({"d": np.full(5, np.nan)}, "must be finite"),
+    ({"p": np.full(12, np.nan)}, "must be finite"),
+    ({"p": np.hstack([np.diag([0.0, 20, 1]), np.zeros((3, 1))]).reshape(-1)}, "focal lengths in P .* not positive"),
+    ({"r": np.diag([1.0, 1.0, 0.5]).reshape(-1)}, "R of the CameraInfo of .* is not a rotation"),
+    ({"width": 11}, r"principal point \(11.5, 7.5\) in P of the CameraInfo of .* lies outside its 11x16 images"),
+    ({"height": 7}, "lies outside its 24x7 images"),
+    ({"width": 0}, "is for images of 0x16"),
+    ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are impossible for a camera"),
+])  # fmt: skip
 def test_an_impossible_calibration_is_refused(tmp_path, values, sentence):
     edit = changed("left/camera_info", values)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=sentence):
         raise LogError(log.missing["left"])
 
 
-@pytest.mark.parametrize(
-    ("model", "count", "sentence"),
-    [
-        ("fisheye", 4, "cannot be rectified with their CameraInfo: unknown distortion model 'fisheye'"),
-        ("plumb_bob", 3, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
-        ("plumb_bob", 8, ""),  # the name of many drivers for a rational polynomial
-    ],
-)
+@pytest.mark.parametrize(("model", "count", "sentence"), [
+    ("fisheye", 4, "cannot be rectified with their CameraInfo: unknown distortion model 'fisheye'"),
+    ("plumb_bob", 3, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
+    ("plumb_bob", 8, ""),  # the name of many drivers for a rational polynomial
+])  # fmt: skip
 def test_an_unknown_distortion_is_reported_before_the_run(tmp_path, model, count, sentence):
     edit = changed("camera_info", {"distortion_model": model, "d": np.full(count, 1e-3)})
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RAW)) as log:
@@ -225,17 +213,14 @@ def test_a_calibration_without_a_frame_has_that_of_its_images(tmp_path):
         assert [camera.frame_id for camera in log.resolution.cameras or ()] == ["left_optical", "right_optical"]
 
 
-@pytest.mark.parametrize(
-    ("more", "sentence"),
-    [
-        (Transform("mast", "imu_link", np.eye(3), [0, 0, 1]), "'imu_link' has two parents, 'base_link' and 'mast'"),
-        (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4001]), "contradicts an earlier one"),
-        (Transform("imu_link", "base_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
-        (Transform("left_optical", "imu_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
-        (Transform("imu_link", "imu_link", np.eye(3), [0, 0, 1]), "contradicts an earlier one"),
-        (Transform("", "imu_link", np.eye(3), [0, 0, 1]), "lacks the name of a frame"),
-    ],
-)
+@pytest.mark.parametrize(("more", "sentence"), [
+    (Transform("mast", "imu_link", np.eye(3), [0, 0, 1]), "'imu_link' has two parents, 'base_link' and 'mast'"),
+    (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4001]), "contradicts an earlier one"),
+    (Transform("imu_link", "base_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
+    (Transform("left_optical", "imu_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
+    (Transform("imu_link", "imu_link", np.eye(3), [0, 0, 1]), "contradicts an earlier one"),
+    (Transform("", "imu_link", np.eye(3), [0, 0, 1]), "lacks the name of a frame"),
+])  # fmt: skip
 def test_an_invalid_transform_is_reported_and_left_out(tmp_path, more, sentence):
     with McapSource().open(write_sample(tmp_path / "log.mcap", mounted(*TRANSFORMS, more))) as log:
         assert log.missing == {}

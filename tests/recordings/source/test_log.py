@@ -124,16 +124,13 @@ def test_undecodable_messages_of_a_used_topic_are_counted(sample, tmp_path, topi
     assert described["damage"] == [losses[0][1]]
 
 
-@pytest.mark.parametrize(
-    ("topic", "fields", "stream"),
-    [
-        (TILT, (b"orientation", b"orientatiox"), "inclinometer"),
-        ("/tf_static", (b"transforms", b"transformed"), "mount"),
-        ("/tf_static", (b"child_frame_id", b"child_frame_ix"), "mount"),
-        (INFO, (b"float64[9] k", b"float64[9] q"), "left"),
-        (INFO, (b"float64[12] p", b"float64[4] p\nfloat64[8] q"), "left"),
-    ],
-)
+@pytest.mark.parametrize(("topic", "fields", "stream"), [
+    (TILT, (b"orientation", b"orientatiox"), "inclinometer"),
+    ("/tf_static", (b"transforms", b"transformed"), "mount"),
+    ("/tf_static", (b"child_frame_id", b"child_frame_ix"), "mount"),
+    (INFO, (b"float64[9] k", b"float64[9] q"), "left"),
+    (INFO, (b"float64[12] p", b"float64[4] p\nfloat64[8] q"), "left"),
+])  # fmt: skip
 def test_a_type_with_wrong_fields_is_reported(sample, tmp_path, topic, fields, stream):
     def encode(name, number, schema):
         return "cdr", schema.replace(*fields) if name == topic else schema

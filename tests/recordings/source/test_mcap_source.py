@@ -109,40 +109,34 @@ def test_a_range_contains_complete_frames_and_their_tilts(sample):
         McapSource().open(sample, start=0.3, end=0.2)
 
 
-@pytest.mark.parametrize(
-    ("edit", "stream", "sentence"),
-    [
-        (dropped("/stereo/right"), "right", f"the log has only one image topic \\({LEFT}\\), but stereo needs two"),
-        (dropped("/stereo"), "left", "the log has no camera image"),
-        (dropped(INFO), "left", f"no CameraInfo belongs to {LEFT} .*; set 'left_info' of the source"),
-        (dropped(TILT), "inclinometer", "the log has no tilt"),
-        (dropped(TILT), "mount", "the mount needs an inclinometer"),
-        (dropped("/tf_static"), "mount", r"static transform joins the camera \('left_optical'\) and the inclinometer"),
-        (dropped("/odom"), "odometry", "the log has no nav_msgs/Odometry"),
-        (changed(TILT, {"orientation_covariance": np.full(9, -1.0)}), "inclinometer", "contains no orientation"),
-        (changed("right/camera_info", {"p": np.hstack([model().k, np.zeros((3, 1))]).reshape(-1)}), "left",
-         "does not contain the baseline"),
-        (changed("right/camera_info", {"p": np.hstack([model().k, [[5.0], [0], [0]]]).reshape(-1)}), "left",
-         f"the baseline is -0.25 m, so {LEFT} is the right camera"),
-        (changed(INFO, {"k": np.zeros(9), "p": np.zeros(12)}), "left", "is not calibrated"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("edit", "stream", "sentence"), [
+    (dropped("/stereo/right"), "right", f"the log has only one image topic \\({LEFT}\\), but stereo needs two"),
+    (dropped("/stereo"), "left", "the log has no camera image"),
+    (dropped(INFO), "left", f"no CameraInfo belongs to {LEFT} .*; set 'left_info' of the source"),
+    (dropped(TILT), "inclinometer", "the log has no tilt"),
+    (dropped(TILT), "mount", "the mount needs an inclinometer"),
+    (dropped("/tf_static"), "mount", r"static transform joins the camera \('left_optical'\) and the inclinometer"),
+    (dropped("/odom"), "odometry", "the log has no nav_msgs/Odometry"),
+    (changed(TILT, {"orientation_covariance": np.full(9, -1.0)}), "inclinometer", "contains no orientation"),
+    (changed("right/camera_info", {"p": np.hstack([model().k, np.zeros((3, 1))]).reshape(-1)}), "left",
+     "does not contain the baseline"),
+    (changed("right/camera_info", {"p": np.hstack([model().k, [[5.0], [0], [0]]]).reshape(-1)}), "left",
+     f"the baseline is -0.25 m, so {LEFT} is the right camera"),
+    (changed(INFO, {"k": np.zeros(9), "p": np.zeros(12)}), "left", "is not calibrated"),
+])  # fmt: skip
 def test_missing_streams_are_reported_with_the_remedy(tmp_path, edit, stream, sentence):
     problems = missing(write_sample(tmp_path / "log.mcap", edit))
     assert stream in problems
     assert re.search(sentence, problems[stream]), problems[stream]
 
 
-@pytest.mark.parametrize(
-    "names",
-    [
-        ("/cam0/image_raw", "/cam1/image_raw"),
-        ("/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
-        ("/rover0/stereo/l/image", "/rover0/stereo/r/image"),
-        ("/stereoLeft/image", "/stereoRight/image"),
-        ("/nav/left/image_rect", "/nav/right/image_rect"),
-    ],
-)
+@pytest.mark.parametrize("names", [
+    ("/cam0/image_raw", "/cam1/image_raw"),
+    ("/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"),
+    ("/rover0/stereo/l/image", "/rover0/stereo/r/image"),
+    ("/stereoLeft/image", "/stereoRight/image"),
+    ("/nav/left/image_rect", "/nav/right/image_rect"),
+])  # fmt: skip
 def test_pairs_are_found_by_common_camera_names(tmp_path, names):
     with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
         assert (log.topics["left"], log.topics["right"]) == names
@@ -190,26 +184,23 @@ CROPPED = {"height": HEIGHT - 2, "data": lambda data: data[: 3 * WIDTH * (HEIGHT
 
 
 @pytest.mark.parametrize("odd", [range(FRAMES), range(1), range(FRAMES - 1, FRAMES), range(1, FRAMES - 1)])
-@pytest.mark.parametrize(
-    ("topic", "values", "problems"),
-    [
-        (
-            RIGHT, DEEP,
-            dict.fromkeys(
-                ("left", "right"),
-                f"the images on {LEFT} are 24x16 of 8 bit, those on {RIGHT} are 24x16 of 16 bit; "
-                "record both in one format",
-            ),
+@pytest.mark.parametrize(("topic", "values", "problems"), [
+    (
+        RIGHT, DEEP,
+        dict.fromkeys(
+            ("left", "right"),
+            f"the images on {LEFT} are 24x16 of 8 bit, those on {RIGHT} are 24x16 of 16 bit; "
+            "record both in one format",
         ),
-        (
-            LEFT, CROPPED,
-            {
-                "left": f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning "
-                "and region of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
-            },
-        ),
-    ],
-)  # fmt: skip
+    ),
+    (
+        LEFT, CROPPED,
+        {
+            "left": f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning "
+            "and region of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
+        },
+    ),
+])  # fmt: skip
 def test_mismatched_images_are_reported_unless_some_match(tmp_path, topic, values, problems, odd):
     path = write_sample(tmp_path / "log.mcap", changed(topic, values, odd))
     assert missing(path) == (problems if len(odd) == FRAMES else {})
@@ -240,20 +231,17 @@ def test_plain_angles_are_read_by_the_settings(tmp_path):
     assert (tilt.frame_id, tilt.stamp) == ("imu_link", START)
 
 
-@pytest.mark.parametrize(
-    ("settings_", "sentence"),
-    [
-        ({"pitch": PITCH}, "needs 'roll'"),
-        ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model'"),
-        ({"pitch": PITCH, "roll": ROLL, "tilt_model": "best"}, "tilt_model must be one of axis, euler"),
-        ({"camera_from_inclinometer": (1.0, 1.0, 0.0, 0.0)}, "must be a unit quaternion"),
-        ({"camera_from_inclinometer": 1}, "must be a unit quaternion"),
-        ({"camera_from_inclinometer": "abcd"}, "must be a unit quaternion"),
-        ({"camera_from_inclinometer": [0, 0, 0, None]}, "must be a unit quaternion"),
-        ({"camera_from_inclinometer": ["0", "0", "0", "1"]}, "must be a unit quaternion"),
-        ({"camera_from_inclinometer": [[1, 0], [0, 1], [0, 0], [0, 0]]}, "must be a unit quaternion"),
-    ],
-)
+@pytest.mark.parametrize(("settings_", "sentence"), [
+    ({"pitch": PITCH}, "needs 'roll'"),
+    ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model'"),
+    ({"pitch": PITCH, "roll": ROLL, "tilt_model": "best"}, "tilt_model must be one of axis, euler"),
+    ({"camera_from_inclinometer": (1.0, 1.0, 0.0, 0.0)}, "must be a unit quaternion"),
+    ({"camera_from_inclinometer": 1}, "must be a unit quaternion"),
+    ({"camera_from_inclinometer": "abcd"}, "must be a unit quaternion"),
+    ({"camera_from_inclinometer": [0, 0, 0, None]}, "must be a unit quaternion"),
+    ({"camera_from_inclinometer": ["0", "0", "0", "1"]}, "must be a unit quaternion"),
+    ({"camera_from_inclinometer": [[1, 0], [0, 1], [0, 0], [0, 0]]}, "must be a unit quaternion"),
+])  # fmt: skip
 def test_incomplete_angle_settings_are_refused(settings_, sentence):
     with pytest.raises(ValueError, match=sentence):
         McapSource(**settings_)

@@ -181,23 +181,20 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
         assert "set 'joints'" in log.missing["mount"]
 
 
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ("", "contains no names with values"),
-        ("{}", "has no joints; write one entry each"),
-        ("pan: !!timestamp x", "cannot be read as YAML"),
-        ("pan: " + "[" * 2000, "cannot be read as YAML"),
-        ("pan: " + "9" * 5000, "cannot be read as YAML"),
-        (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "which are not three numbers"),
-        ("pan: [1, 2]", "joint 'pan' is no mapping"),
-        ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),
-        ("pan: {parent: a}", "joint 'pan' needs the name of its frame 'child'"),
-        ("pan: {parent: a, child: b, xyz: [1, 2, x]}", "joint 'pan' has xyz: [1, 2, 'x'], which are not three numbers"),
-        ("pan: {parent: a, child: b, axis: [0, 0, 0]}", "joint 'pan' has the axis 0"),
-        ("pan: {parent: a, child", "cannot be read as YAML"),
-    ],
-)
+@pytest.mark.parametrize(("content", "sentence"), [
+    ("", "contains no names with values"),
+    ("{}", "has no joints; write one entry each"),
+    ("pan: !!timestamp x", "cannot be read as YAML"),
+    ("pan: " + "[" * 2000, "cannot be read as YAML"),
+    ("pan: " + "9" * 5000, "cannot be read as YAML"),
+    (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "which are not three numbers"),
+    ("pan: [1, 2]", "joint 'pan' is no mapping"),
+    ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),
+    ("pan: {parent: a}", "joint 'pan' needs the name of its frame 'child'"),
+    ("pan: {parent: a, child: b, xyz: [1, 2, x]}", "joint 'pan' has xyz: [1, 2, 'x'], which are not three numbers"),
+    ("pan: {parent: a, child: b, axis: [0, 0, 0]}", "joint 'pan' has the axis 0"),
+    ("pan: {parent: a, child", "cannot be read as YAML"),
+])  # fmt: skip
 def test_a_wrong_file_of_joints_is_refused(tmp_path, content, sentence):
     file = tmp_path / "mast.yaml"
     file.write_text(content)

@@ -55,10 +55,9 @@ def test_a_stated_sigma_counts_unless_the_readings_show_a_larger_one():
     assert shown(readings(stated=0.8))[0] == pytest.approx(0.8)
 
 
-@pytest.mark.parametrize(
-    ("variances", "sigma"),
-    [((1e-4, 1e-4, 3.0), 0.01), ((3.0, 1e-4, 1e-4), 0.01), ((0, 0, 0), None), ((np.nan, 1, 1), None), ((9,) * 3, None)],
-)  # fmt: skip
+@pytest.mark.parametrize(("variances", "sigma"), [
+    ((1e-4, 1e-4, 3.0), 0.01), ((3.0, 1e-4, 1e-4), 0.01), ((0, 0, 0), None), ((np.nan, 1, 1), None), ((9,) * 3, None),
+])  # fmt: skip
 def test_the_covariance_of_an_imu_states_the_sigma(variances, sigma):
     message = ros2.imu(5, "imu", np.array([0, 0, 0, 1.0]), np.diag(variances))
     assert tilt_of(message, 5).sigma == (None if sigma is None else pytest.approx(sigma))

@@ -77,14 +77,11 @@ def default(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dic
     return {IMU: message}
 
 
-@pytest.mark.parametrize(
-    ("messages", "why"),
-    [
-        (kalibr, "is not a rotation: [0.0, 0.0, 0.0, 0.0]"),
-        (absent, "the Imu marks its orientation as absent"),
-        (default, "it is 1 in every message"),
-    ],
-)
+@pytest.mark.parametrize(("messages", "why"), [
+    (kalibr, "is not a rotation: [0.0, 0.0, 0.0, 0.0]"),
+    (absent, "the Imu marks its orientation as absent"),
+    (default, "it is 1 in every message"),
+])  # fmt: skip
 def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why):
     driven = drive(seconds=12)
     path = written(tmp_path / "log.mcap", driven, messages)
@@ -177,16 +174,12 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
     assert "gyroscope' is set to /left/image_rect" in missing(named, McapSource(gyroscope="/left/image_rect"))
 
 
-@pytest.mark.parametrize(
-    ("rates", "wrong"),
-    [
-        (lambda rate: rate, False),
-        (np.degrees, True),
-        (lambda rate: rate[[1, 0, 2]], True),
-        *slow((lambda rate: -rate, True), (lambda rate: rate * [1, -1, 1], True)),
-    ],
-    ids=["sound", "degrees", "exchanged", "sign", "left-handed"],
-)
+@pytest.mark.parametrize(("rates", "wrong"), [
+    (lambda rate: rate, False),
+    (np.degrees, True),
+    (lambda rate: rate[[1, 0, 2]], True),
+    *slow((lambda rate: -rate, True), (lambda rate: rate * [1, -1, 1], True)),
+], ids=["sound", "degrees", "exchanged", "sign", "left-handed"])  # fmt: skip
 def test_rates_that_contradict_the_accelerations_are_a_fault(tmp_path, rates, wrong):
     path = written(tmp_path / "log.mcap", drive(seconds=20), lambda n, t, rate, force: kalibr(n, t, rates(rate), force))
     with McapSource().open(path) as log:
