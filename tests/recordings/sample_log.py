@@ -60,18 +60,14 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     "no compression": {"compression": CompressionType.NONE, "chunk_size": 4000},
     "no message index": {"index_types": IndexType.CHUNK},
     "no index": {
-        "index_types": IndexType.NONE,
-        "repeat_channels": False,
-        "repeat_schemas": False,
-        "use_statistics": False,
+        "index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False,
     },
     "no chunks": {"use_chunking": False, "enable_data_crcs": True},
     "no crcs": {"enable_crcs": False},
     "messages compressed one by one": {
-        "compression": CompressionType.NONE,
-        "change": lambda topic, index, data: ZstdCompressor().compress(data),
+        "compression": CompressionType.NONE, "change": lambda topic, index, data: ZstdCompressor().compress(data),
     },
-}
+}  # fmt: skip
 
 
 def write_sample(path: Path, *edits: Edit, names: tuple[str, str] = (LEFT, RIGHT)) -> Path:
@@ -152,6 +148,23 @@ def frame_of(path: Path) -> StereoFrame:
 def with_extra(path: Path, extra: Extra, **options: Any) -> Path:
     """Write the log with something more. extra, options: of `write_mcap`."""
     return rewrite(write_sample(path.with_name("sample.mcap")), path, extra=extra, **options)
+
+
+def missing_in(path: Path, **settings: Any) -> dict[str, str]:
+    """The streams that a log lacks, each with the reason. settings: of the source."""
+    with McapSource(**settings).open(path) as log:
+        return log.missing
+
+
+def refused_in(path: Path, **settings: Any) -> dict[str, str]:
+    """The settings of the source that a log does not allow, each with the reason."""
+    with McapSource(**settings).open(path) as log:
+        return log.refused
+
+
+def losses_in(events: Iterable[Event]) -> list[tuple[int, str, str]]:
+    """The losses among events, with their sentences."""
+    return [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
 
 
 def inventory_of(path: Path, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:

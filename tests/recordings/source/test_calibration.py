@@ -20,8 +20,11 @@ from tests.recordings.sample_log import (
     TRANSFORMS,
     changed,
     dropped,
+    losses_in,
+    missing_in,
     model,
     mounted,
+    refused_in,
     replaced,
     tilt_quaternion,
     write_sample,
@@ -47,7 +50,6 @@ def turned(axis: str, degrees: float) -> np.ndarray:
 def test_parallel_cameras_need_no_rectification(tmp_path, names):
     beside = Transform("left_optical", "right_optical", np.eye(3), [0.25, 0.001, 0])
     with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
-        assert log.resolution.cameras is not None
         assert [camera.rectified for camera in log.resolution.cameras] == [True, True]
         assert log.resolution.cameras[1].model.p[0, 3] == pytest.approx(-20 * 0.25)
 
@@ -71,8 +73,8 @@ def test_cameras_that_are_not_parallel_need_rectification(tmp_path, rotation, pl
     assert places[0][1] == pytest.approx(places[1][1], abs=1e-9)
     disparity = places[0][0] - places[1][0] + right.model.p[0, 2] - left.model.p[0, 2]
     assert -right.model.p[0, 3] / disparity == pytest.approx((left.model.r @ point)[2], rel=1e-9)  # the depth
-    with McapSource().open(single_calibrations(tmp_path / "rect.mcap", RECTIFIED, beside, fx)) as log:
-        assert "are rectified by their names, but the cameras are not parallel by" in log.missing["left"]
+    rectified = single_calibrations(tmp_path / "rect.mcap", RECTIFIED, beside, fx)
+    assert "are rectified by their names, but the cameras are not parallel by" in missing_in(rectified)["left"]
 
 
 @pytest.mark.parametrize("place", [[0, -0.25, 0], [0, 0.25, 0], [0.15, 0, 0.2], [0, 0, -0.25], [-0.25, 0, 0]])
@@ -80,8 +82,7 @@ def test_cameras_that_are_not_parallel_need_rectification(tmp_path, rotation, pl
 def test_a_right_camera_not_beside_the_left_or_exchanged_with_it_is_refused(tmp_path, names, place):
     beside = Transform("left_optical", "right_optical", np.eye(3), place)
     why = f"so {names[0]} is the right camera" if place[0] < 0 else "these are not optical frames"
-    with McapSource().open(single_calibrations(tmp_path / "log.mcap", names, beside)) as log:
-        assert why in log.missing["left"]
+    assert why in missing_in(single_calibrations(tmp_path / "log.mcap", names, beside))["left"]
 
 
 @pytest.mark.parametrize(("values", "sentence"), [
@@ -96,39 +97,33 @@ def test_a_right_camera_not_beside_the_left_or_exchanged_with_it_is_refused(tmp_
     ({"p": np.hstack([np.diag([1e-300, 20, 1]), [[-1e300], [0], [0]]]).reshape(-1)}, "are impossible for a camera"),
 ])  # fmt: skip
 def test_an_impossible_calibration_is_refused(tmp_path, values, sentence):
-    edit = changed("left/camera_info", values)
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log, pytest.raises(LogError, match=sentence):
-        raise LogError(log.missing["left"])
+    log = write_sample(tmp_path / "log.mcap", changed("left/camera_info", values))
+    assert re.search(sentence, missing_in(log)["left"])
 
 
-@pytest.mark.parametrize(("model", "count", "sentence"), [
-    ("fisheye", 4, "cannot be rectified with their CameraInfo: unknown distortion model 'fisheye'"),
-    ("plumb_bob", 3, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
-    ("plumb_bob", 8, ""),  # the name of many drivers for a rational polynomial
+@pytest.mark.parametrize(("values", "sentence"), [
+    ({"distortion_model": "fisheye"}, "cannot be rectified with their CameraInfo: unknown distortion model 'fisheye'"),
+    ({"d": np.full(3, 1e-3)}, "a plumb_bob camera has 0 or 4 or 5 or .* coefficients, the calibration has 3"),
+    ({"d": np.full(8, 1e-3)}, "^$"),  # the name of many drivers for a rational polynomial
+    ({"k": np.zeros(9), "d": np.full(5, 0.1)}, "no focal length in K"),
 ])  # fmt: skip
-def test_an_unknown_distortion_is_reported_before_the_run(tmp_path, model, count, sentence):
-    edit = changed("camera_info", {"distortion_model": model, "d": np.full(count, 1e-3)})
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RAW)) as log:
-        assert re.search(sentence, log.missing["left"]) if sentence else not log.missing
+def test_a_distortion_that_cannot_be_removed_is_reported_before_the_run(tmp_path, values, sentence):
+    edit = changed("camera_info", {"d": np.full(4, 1e-3), **values})
+    assert re.search(sentence, missing_in(write_sample(tmp_path / "log.mcap", edit, names=RAW)).get("left", ""))
 
 
-@pytest.mark.parametrize("distorted", [False, True])
-def test_a_calibration_with_only_p_means_rectified_images(tmp_path, distorted):
-    edit = changed("camera_info", {"k": np.zeros(9), "d": np.full(5, 0.1 * distorted)})
+def test_a_calibration_with_only_p_means_rectified_images(tmp_path):
+    edit = changed("camera_info", {"k": np.zeros(9), "d": np.zeros(5)})
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=RAW)) as log:
-        if distorted:
-            assert "no focal length in K" in log.missing["left"]
-        else:
-            assert log.resolution.cameras is not None
-            assert all(camera.rectified for camera in log.resolution.cameras)
+        assert [camera.rectified for camera in log.resolution.cameras] == [True, True]
 
 
 @pytest.mark.parametrize("names", [RAW, RECTIFIED])
 @pytest.mark.parametrize(("place", "value", "sentence"), [(0, 18.6, "fx is 20 and 18.6"), (6, 8.5, "cy is 7.5")])
 def test_projections_of_no_rectified_pair_are_refused(tmp_path, names, place, value, sentence):
     edit = changed("/right/camera_info", {"p": lambda p: np.where(np.arange(12) == place, value, p)})
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, names=names)) as log:
-        assert f"does not belong to a rectified pair: {sentence}" in log.missing["left"]
+    log = write_sample(tmp_path / "log.mcap", edit, names=names)
+    assert f"does not belong to a rectified pair: {sentence}" in missing_in(log)["left"]
 
 
 def test_lenses_without_a_rectified_image_are_refused():
@@ -180,22 +175,22 @@ def test_a_pose_is_transformed_to_the_rover_or_its_camera(tmp_path, with_base):
 
 
 def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path):
-    with McapSource(base_frame="rover").open(write_sample(tmp_path / "log.mcap")) as log:
-        assert log.refused["base_frame"].startswith("the source's 'base_frame' is set to 'rover', but /tf_static")
-        assert "joins the camera to 'base_link' only; set it to one of these" in log.refused["base_frame"]
-    with McapSource(base_frame="imu_link").open(write_sample(tmp_path / "log.mcap")) as log:
-        assert log.refused == {}
+    log = write_sample(tmp_path / "log.mcap")
+    why = refused_in(log, base_frame="rover")["base_frame"]
+    assert why.startswith("the source's 'base_frame' is set to 'rover', but /tf_static")
+    assert "joins the camera to 'base_link' only; set it to one of these" in why
+    assert refused_in(log, base_frame="imu_link") == {}
     bare = mounted(TRANSFORMS[0].inverse().after(TRANSFORMS[1]))
-    with McapSource(base_frame="rover").open(write_sample(tmp_path / "log.mcap", bare)) as log:
-        assert log.refused == {}  # the log has no better one
-        assert "no static transform joins 'rover' and the camera" in log.notes()["mount"]
+    with McapSource(base_frame="rover").open(write_sample(tmp_path / "bare.mcap", bare)) as opened:
+        assert opened.refused == {}  # the log has no better one
+        assert "no static transform joins 'rover' and the camera" in opened.notes()["mount"]
 
 
 @pytest.mark.parametrize(("problems", "resting"), [("base_link", "imu_link"), ("left_optical", "base_link")])
 def test_a_pose_in_a_frame_of_the_rover_is_refused(tmp_path, problems, resting):
     edit = changed("/odom", {"header.frame_id": resting, "child_frame_id": problems})
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert f"a pose in the frame '{resting}', which moves with the rover" in log.missing["odometry"]
+    log = write_sample(tmp_path / "log.mcap", edit)
+    assert f"a pose in the frame '{resting}', which moves with the rover" in missing_in(log)["odometry"]
 
 
 def test_frames_without_names_are_not_connected(tmp_path):
@@ -228,10 +223,9 @@ def test_an_invalid_transform_is_reported_and_left_out(tmp_path, more, sentence)
         np.testing.assert_allclose(
             log.resolution.mount.camera_from_inclinometer, TRANSFORMS[0].rotation.T @ TRANSFORMS[1].rotation, atol=1e-12
         )
-        problems = [(stream, item) for _, stream, item in log.events() if isinstance(item, Exception)]
-    assert [stream for stream, _ in problems] == ["log"]
-    with pytest.raises(LogError, match=sentence):
-        raise problems[0][1]
+        ((_, stream, problem),) = losses_in(log.events())
+    assert stream == "log"
+    assert sentence in problem
 
 
 def test_an_infinite_translation_is_reported_and_left_out(tmp_path):
@@ -241,13 +235,13 @@ def test_an_infinite_translation_is_reported_and_left_out(tmp_path):
 
     with McapSource().open(write_sample(tmp_path / "log.mcap", replaced("/tf_static", broken))) as log:
         assert "no static transform joins the camera" in log.missing["mount"]
-        problems = [str(item) for _, _, item in log.events() if isinstance(item, Exception)]
+        ((_, _, problem),) = losses_in(log.events())
     what = "the translation of the transform 'base_link' <- 'left_optical'"
-    assert problems == [f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"]
+    assert problem == f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"
 
 
 def test_a_long_chain_of_transforms_is_followed():
-    frames, message = TransformTree(), TRANSFORMS[0]
+    frames = TransformTree()
     links = [Transform(f"link{i}", f"link{i + 1}", np.eye(3), np.array([0.1, 0.0, 0.0])) for i in range(1200)]
     for _ in range(3):
         for link in links:
@@ -256,9 +250,8 @@ def test_a_long_chain_of_transforms_is_followed():
     assert (whole.parent, whole.child) == ("link0", "link1200")
     np.testing.assert_allclose(whole.translation, [120.0, 0.0, 0.0], atol=1e-6)
     assert frames.between("link1200", "link0").translation[0] == pytest.approx(-120.0)
-    assert frames.between("link0", "elsewhere") is None
-    assert frames.between("elsewhere", "link0") is None
-    assert frames.between(message.parent, "link0") is None
+    for unjoined in (("link0", "elsewhere"), ("elsewhere", "link0"), ("base_link", "link0")):
+        assert frames.between(*unjoined) is None
 
 
 def test_a_repeated_transform_is_no_contradiction(tmp_path):
@@ -271,5 +264,5 @@ def test_a_repeated_transform_is_no_contradiction(tmp_path):
 def test_cameras_at_the_same_place_are_named(tmp_path):
     single = changed("right/camera_info", {"p": model().p.ravel()})
     edit = mounted(*TRANSFORMS, replace(TRANSFORMS[0], child="right_optical"))
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit, single)) as log:
-        assert log.missing["left"].startswith("the baseline is 0 m: P[0,3] of the right CameraInfo is 0, and 'left")
+    why = missing_in(write_sample(tmp_path / "log.mcap", edit, single))["left"]
+    assert why.startswith("the baseline is 0 m: P[0,3] of the right CameraInfo is 0, and 'left")

@@ -20,6 +20,7 @@ from tests.recordings.sample_log import (
     dropped,
     inventory_of,
     items_of,
+    losses_in,
     write_sample,
 )
 
@@ -35,7 +36,7 @@ def test_an_image_under_another_calibration_is_lost(tmp_path, lag):
     path = rewrite(plain, tmp_path / "log.mcap", time=late)
     events = items_of(path)
     assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
-    lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
+    lost = losses_in(events)
     assert [(time, stream) for time, stream, _ in lost] == [
         (START + number * PERIOD + IMAGE_LAG, "left") for number in (2, 3)
     ]
@@ -99,10 +100,10 @@ def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path):
 
 
 def test_a_tilt_of_another_sensor_is_lost(tmp_path):
-    events = items_of(write_sample(tmp_path / "log.mcap", changed(TILT, {"header.frame_id": "other_imu"}, [3])))
-    lost = [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
-    assert [(time, stream) for time, stream, _ in lost] == [(START + 3 * PERIOD, "inclinometer")]
-    assert "its frame is 'other_imu', but the mount is that of 'imu_link'" in lost[0][2]
+    edit = changed(TILT, {"header.frame_id": "other_imu"}, [3])
+    ((time, stream, why),) = losses_in(items_of(write_sample(tmp_path / "log.mcap", edit)))
+    assert (time, stream) == (START + 3 * PERIOD, "inclinometer")
+    assert "its frame is 'other_imu', but the mount is that of 'imu_link'" in why
 
 
 @pytest.mark.parametrize(("topic", "stream"), [(TILT, "inclinometer"), (LEFT, "left"), (INFO, "left")])
@@ -114,14 +115,14 @@ def test_undecodable_messages_of_a_used_topic_are_counted(sample, tmp_path, topi
     with McapSource().open(path) as log:
         assert log.missing == {}
         assert log.frames == (3 if topic == LEFT else FRAMES)
-        losses = [(name, str(item)) for _, name, item in log.events() if isinstance(item, Exception)]
-    assert [name for name, _ in losses] == [stream]
-    assert f"{topic}: 2 messages of its channel" in losses[0][1]
-    assert "in 'cbor', which cannot be read" in losses[0][1]
+        ((_, lossy, why),) = losses_in(log.events())
+    assert lossy == stream
+    assert f"{topic}: 2 messages of its channel" in why
+    assert "in 'cbor', which cannot be read" in why
     described = inventory_of(path)
     counts = [(item["encoding"], item["messages"]) for item in described["topics"] if item["topic"] == topic]
     assert sorted(counts) == [("cbor", 2), ("cdr", 3)]
-    assert described["damage"] == [losses[0][1]]
+    assert described["damage"] == [why]
 
 
 @pytest.mark.parametrize(("topic", "fields", "stream"), [
@@ -148,9 +149,8 @@ def test_excerpts_are_spread_over_the_whole_log(tmp_path, start):
         excerpts = [list(events) for events in log.excerpts(2, {"left", "right"})]
     stamps = [[(stream, (item.stamp - START) // PERIOD) for _, stream, item in events] for events in excerpts]
     assert [found[0] for found in stamps] == [("left", 1), ("left", 3)]
-    assert [sorted(set(found)) for found in stamps] == [
-        sorted((side, number) for side in ("left", "right") for number in range(first, FRAMES)) for first in (1, 3)
-    ]
+    for found, first in zip(stamps, (1, 3), strict=True):
+        assert set(found) == {(side, number) for side in ("left", "right") for number in range(first, FRAMES)}
 
 
 def test_at_most_one_excerpt_begins_at_a_frame(tmp_path):

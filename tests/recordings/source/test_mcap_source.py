@@ -31,6 +31,7 @@ from tests.recordings.sample_log import (
     essences,
     inventory_of,
     items_of,
+    missing_in,
     model,
     picture,
     replaced,
@@ -40,11 +41,6 @@ from tests.recordings.sample_log import (
 )  # fmt: skip
 
 INFO = "/stereo/left/camera_info"
-
-
-def missing(path: Path, source: McapSource | None = None) -> dict[str, str]:
-    with (source or McapSource()).open(path) as log:
-        return log.missing
 
 
 def test_messages_are_read_bit_for_bit(sample):
@@ -125,9 +121,7 @@ def test_a_range_contains_complete_frames_and_their_tilts(sample):
     (changed(INFO, {"k": np.zeros(9), "p": np.zeros(12)}), "left", "is not calibrated"),
 ])  # fmt: skip
 def test_missing_streams_are_reported_with_the_remedy(tmp_path, edit, stream, sentence):
-    problems = missing(write_sample(tmp_path / "log.mcap", edit))
-    assert stream in problems
-    assert re.search(sentence, problems[stream]), problems[stream]
+    assert re.search(sentence, missing_in(write_sample(tmp_path / "log.mcap", edit))[stream])
 
 
 @pytest.mark.parametrize("names", [
@@ -140,9 +134,8 @@ def test_missing_streams_are_reported_with_the_remedy(tmp_path, edit, stream, se
 def test_pairs_are_found_by_common_camera_names(tmp_path, names):
     with McapSource().open(write_sample(tmp_path / "log.mcap", names=names)) as log:
         assert (log.topics["left"], log.topics["right"]) == names
-        assert {item.stamp for _, stream, item in log.events() if stream == "left"} == {
-            START + n * PERIOD for n in range(FRAMES)
-        }
+        stamps = {item.stamp for _, stream, item in log.events() if stream == "left"}
+    assert stamps == {START + n * PERIOD for n in range(FRAMES)}
 
 
 def test_a_bad_message_is_lost_alone(tmp_path):
@@ -161,49 +154,37 @@ def test_a_bad_message_is_lost_alone(tmp_path):
 
 def test_an_unsupported_encoding_is_reported_before_the_run(tmp_path):
     path = write_sample(tmp_path / "log.mcap", changed(RIGHT, {"encoding": "packed10"}))
-    with McapSource().open(path) as log:
-        assert list(log.missing) == ["right"]
-        assert log.missing["right"].startswith(f"{RIGHT}: the image encoding 'packed10' is not supported")
-        assert "record it in one of mono8, 8UC1, " in log.missing["right"]
+    missing = missing_in(path)
+    assert list(missing) == ["right"]
+    assert missing["right"].startswith(f"{RIGHT}: the image encoding 'packed10' is not supported")
+    assert "record it in one of mono8, 8UC1, " in missing["right"]
     described = inventory_of(path)
-    assert (described["frames"]["pairs"], described["missing"]) == (0, log.missing)
+    assert (described["frames"]["pairs"], described["missing"]) == (0, missing)
 
 
 @pytest.mark.parametrize("whole", [None, FRAMES // 2])
 def test_a_camera_with_only_broken_images_is_missing(tmp_path, whole, monkeypatch):
     edit = changed(RIGHT, {"data": lambda data: data[:-5]}, {*range(FRAMES)} - {whole})
     monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
-    with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
-        assert list(log.missing) == (["right"] if whole is None else [])
-        if whole is None:
-            assert log.missing["right"].startswith(f"{RIGHT}: the image is cut: ")
+    problems = missing_in(write_sample(tmp_path / "log.mcap", edit))
+    assert list(problems) == (["right"] if whole is None else [])
+    assert all(why.startswith(f"{RIGHT}: the image is cut: ") for why in problems.values())
 
 
 DEEP = {"encoding": "mono16", "step": 2 * WIDTH, "data": lambda data: data[: 2 * WIDTH * HEIGHT]}
 CROPPED = {"height": HEIGHT - 2, "data": lambda data: data[: 3 * WIDTH * (HEIGHT - 2)]}
+UNLIKE = f"the images on {LEFT} are 24x16 of 8 bit, those on {RIGHT} are 24x16 of 16 bit; record both in one format"
+UNCALIBRATED = f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning and region "
+UNCALIBRATED += "of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
 
 
 @pytest.mark.parametrize("odd", [range(FRAMES), range(1), range(FRAMES - 1, FRAMES), range(1, FRAMES - 1)])
-@pytest.mark.parametrize(("topic", "values", "problems"), [
-    (
-        RIGHT, DEEP,
-        dict.fromkeys(
-            ("left", "right"),
-            f"the images on {LEFT} are 24x16 of 8 bit, those on {RIGHT} are 24x16 of 16 bit; "
-            "record both in one format",
-        ),
-    ),
-    (
-        LEFT, CROPPED,
-        {
-            "left": f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning "
-            "and region of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
-        },
-    ),
+@pytest.mark.parametrize(("topic", "values", "streams", "why"), [
+    (RIGHT, DEEP, ("left", "right"), UNLIKE), (LEFT, CROPPED, ("left",), UNCALIBRATED),
 ])  # fmt: skip
-def test_mismatched_images_are_reported_unless_some_match(tmp_path, topic, values, problems, odd):
-    path = write_sample(tmp_path / "log.mcap", changed(topic, values, odd))
-    assert missing(path) == (problems if len(odd) == FRAMES else {})
+def test_mismatched_images_are_reported_unless_some_match(tmp_path, topic, values, streams, why, odd):
+    problems = missing_in(write_sample(tmp_path / "log.mcap", changed(topic, values, odd)))
+    assert problems == dict.fromkeys(streams if len(odd) == FRAMES else (), why)
 
 
 # Plain angles
@@ -219,7 +200,7 @@ PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1
 
 
 def test_plain_angles_are_not_guessed(tmp_path):
-    problems = missing(bare(tmp_path, 10, 20))["inclinometer"]
+    problems = missing_in(bare(tmp_path, 10, 20))["inclinometer"]
     assert "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source" in problems
 
 
@@ -235,12 +216,9 @@ def test_plain_angles_are_read_by_the_settings(tmp_path):
     ({"pitch": PITCH}, "needs 'roll'"),
     ({"pitch": PITCH, "roll": ROLL}, "needs 'tilt_model'"),
     ({"pitch": PITCH, "roll": ROLL, "tilt_model": "best"}, "tilt_model must be one of axis, euler"),
-    ({"camera_from_inclinometer": (1.0, 1.0, 0.0, 0.0)}, "must be a unit quaternion"),
-    ({"camera_from_inclinometer": 1}, "must be a unit quaternion"),
-    ({"camera_from_inclinometer": "abcd"}, "must be a unit quaternion"),
-    ({"camera_from_inclinometer": [0, 0, 0, None]}, "must be a unit quaternion"),
-    ({"camera_from_inclinometer": ["0", "0", "0", "1"]}, "must be a unit quaternion"),
-    ({"camera_from_inclinometer": [[1, 0], [0, 1], [0, 0], [0, 0]]}, "must be a unit quaternion"),
+    *(({"camera_from_inclinometer": odd}, "must be a unit quaternion") for odd in (
+        (1.0, 1.0, 0.0, 0.0), 1, "abcd", [0, 0, 0, None], ["0", "0", "0", "1"], [[1, 0], [0, 1], [0, 0], [0, 0]],
+    )),
 ])  # fmt: skip
 def test_incomplete_angle_settings_are_refused(settings_, sentence):
     with pytest.raises(ValueError, match=sentence):

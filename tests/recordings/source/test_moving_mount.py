@@ -16,7 +16,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import camera_info, header, image, imu, odometry, transform_message
 from stages.data import CameraImage, Mount, Pose, Transform
-from tests.recordings.sample_log import START, TRANSFORMS, model, picture
+from tests.recordings.sample_log import START, TRANSFORMS, missing_in, model, picture, refused_in
 
 MS = 1_000_000
 FRAMES, PERIOD, JOINT = 6, 500 * MS, 40 * MS
@@ -61,9 +61,10 @@ def written(path: Path, messages: Messages = joints, static: tuple[Transform, ..
     return path
 
 
-def read(
-    path: Path, source: McapSource | None = None, **bounds: float
-) -> tuple[list[Mount], list[str], dict[str, str]]:
+Read = tuple[list[Mount], list[str], dict[str, str]]
+
+
+def read(path: Path, source: McapSource | None = None, **bounds: float) -> Read:
     """The mounts before the left images, the losses, and the notes."""
     with (source or McapSource()).open(path, **bounds) as log:
         assert log.missing == log.refused == {}
@@ -141,13 +142,13 @@ def test_static_transforms_are_preferred_and_the_pose_of_the_rover_is_no_mount(t
         rover = Transform("odom", "base_link", np.eye(3), np.zeros(3))
         return {"/tf": transform_message([(rover, stamp), (camera, stamp)])}
 
-    with McapSource().open(written(tmp_path / "world.mcap", by_a_world, (IMU,))) as log:
-        assert "record /tf_static (and /tf if the camera moves on the rover" in log.missing["mount"]
+    world = missing_in(written(tmp_path / "world.mcap", by_a_world, (IMU,)))["mount"]
+    assert "record /tf_static (and /tf if the camera moves on the rover" in world
 
 
 def test_a_fixed_rotation_of_a_camera_that_moves_is_refused(tmp_path):
-    with McapSource(camera_from_inclinometer=(0.0, 0.0, 0.0, 1.0)).open(written(tmp_path / "log.mcap")) as log:
-        assert "is a fixed rotation, but the camera moves on the rover" in log.refused["camera_from_inclinometer"]
+    fixed = refused_in(written(tmp_path / "log.mcap"), camera_from_inclinometer=(0.0, 0.0, 0.0, 1.0))
+    assert "is a fixed rotation, but the camera moves on the rover" in fixed["camera_from_inclinometer"]
 
 
 MAST = """
@@ -160,11 +161,8 @@ def angles(stamp: int) -> dict[str, Any]:
     turn = np.radians(20) * (stamp - START) / 1e9
     fields = {"velocity": np.zeros(0), "effort": np.zeros(0)}
     names, positions = ["wheel", "pan"], np.array([7.0, turn])
-    return {
-        "/joints": make(
-            "sensor_msgs/msg/JointState", header=header(stamp, ""), name=names, position=positions, **fields
-        )
-    }
+    state = make("sensor_msgs/msg/JointState", header=header(stamp, ""), name=names, position=positions, **fields)
+    return {"/joints": state}
 
 
 def test_the_angles_of_joints_move_the_camera(tmp_path):
@@ -177,8 +175,7 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
         np.testing.assert_allclose(mount.base_from_camera.rotation, exact.rotation, atol=1e-9)
         np.testing.assert_allclose(mount.base_from_camera.translation[:2], exact.translation[:2], atol=1e-9)
     assert "'base_link' <- 'mast' on /joints is interpolated" in notes["mount"]
-    with McapSource().open(path) as log:
-        assert "set 'joints'" in log.missing["mount"]
+    assert "set 'joints'" in missing_in(path)["mount"]
 
 
 @pytest.mark.parametrize(("content", "sentence"), [
@@ -198,10 +195,9 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
 def test_a_wrong_file_of_joints_is_refused(tmp_path, content, sentence):
     file = tmp_path / "mast.yaml"
     file.write_text(content)
-    with McapSource(joints=str(file)).open(written(tmp_path / "log.mcap", angles)) as log:
-        assert sentence in log.refused["joints"]
-    with McapSource(joints=str(tmp_path / "none.yaml")).open(tmp_path / "log.mcap") as log:
-        assert "cannot read the file of joints" in log.refused["joints"]
+    log = written(tmp_path / "log.mcap", angles)
+    assert sentence in refused_in(log, joints=str(file))["joints"]
+    assert "cannot read the file of joints" in refused_in(log, joints=str(tmp_path / "none.yaml"))["joints"]
 
 
 def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
@@ -226,7 +222,6 @@ def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
 def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
     file = tmp_path / "mast.yaml"
     file.write_text("turret: {parent: base_link, child: mast, axis: [0, 0, 1]}")
-    with McapSource(joints=str(file)).open(written(tmp_path / "log.mcap", angles)) as log:
-        assert log.refused["joints"].endswith("no angles of; it has those of wheel, pan")
-    with McapSource(joints=str(file)).open(written(tmp_path / "none.mcap", lambda stamp: None)) as log:
-        assert log.refused["joints"].endswith("it has no sensor_msgs/JointState")
+    log, none = written(tmp_path / "log.mcap", angles), written(tmp_path / "none.mcap", lambda stamp: None)
+    assert refused_in(log, joints=str(file))["joints"].endswith("no angles of; it has those of wheel, pan")
+    assert refused_in(none, joints=str(file))["joints"].endswith("it has no sensor_msgs/JointState")

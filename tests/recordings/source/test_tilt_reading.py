@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import Severity
 from recordings import McapSource
-from recordings.inventory.description import describe
 from recordings.inventory.text import format_description
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
@@ -22,7 +21,7 @@ from recordings.ros2.to_msg import camera_info, header, image, odometry, quatern
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite, slow
 from tests.recordings.inertial.drive import Drive, drive
-from tests.recordings.sample_log import TRANSFORMS, model, picture
+from tests.recordings.sample_log import TRANSFORMS, inventory_of, missing_in, model, picture
 
 IMU = "/imu0"
 Messages = Callable[[int, int, np.ndarray, np.ndarray], dict[str, Any]]  # number, stamp, rate, force -> by topic
@@ -62,9 +61,9 @@ def read(path: Path, source: McapSource | None = None, **bounds: float) -> tuple
     return [i for i in items if isinstance(i, Tilt)], [str(i) for i in items if not isinstance(i, Tilt)], note
 
 
-def missing(path: Path, source: McapSource | None = None) -> str:
-    with (source or McapSource()).open(path) as log:
-        return log.missing["inclinometer"]
+def missing(path: Path, **settings: Any) -> str:
+    """Why a log lacks the tilt."""
+    return missing_in(path, **settings)["inclinometer"]
 
 
 def absent(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dict[str, Any]:
@@ -92,10 +91,8 @@ def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why
     assert note.startswith(f"up is estimated from the accelerations and rates on {IMU}, because its orientation is not")
     assert why in note
     assert "at rest for 4 of 12 s; gravity is 9.79 m/s2, as on Earth" in note
-    with McapSource().open(path) as log:
-        assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in (
-            format_description(describe(log, max_gap_of=lambda intervals: 10**8))
-        )
+    shown = format_description(inventory_of(path, max_gap=10**8))
+    assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in shown
 
 
 def test_a_part_of_a_log_has_tilts_as_good_as_the_whole(tmp_path):
@@ -148,9 +145,8 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
     assert lost == []
     assert np.sqrt(np.mean(driven.errors(tilts) ** 2)) < 0.3
     assert "the accelerations on /camera/accel/sample and the rates on /camera/gyro/sample" in note
-    assert "joins the accelerometer ('imu_link', /camera/accel/sample) and the gyroscope" in (
-        missing(written(tmp_path / "unjoined.mcap", driven, split))
-    )
+    unjoined = written(tmp_path / "unjoined.mcap", driven, split)
+    assert "joins the accelerometer ('imu_link', /camera/accel/sample) and the gyroscope" in missing(unjoined)
 
     def second(*sample):
         return split(*sample) | {"/drill": raw_imu(sample[1], "drill", sample[2], np.zeros(3))}
@@ -168,10 +164,8 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
         assert "rates that may go with the accelerations of /board (/one, /two)" in log.missing["inclinometer"]
         offered = [remedy.settings for remedy in log.resolution.remedies["inclinometer"]]
     assert offered == [{"gyroscope": "/one"}, {"gyroscope": "/two"}]
-    for settings in offered:
-        with McapSource(**settings).open(several) as log:
-            assert "inclinometer" in log.topics
-    assert "gyroscope' is set to /left/image_rect" in missing(named, McapSource(gyroscope="/left/image_rect"))
+    assert all("inclinometer" not in missing_in(several, **settings) for settings in offered)
+    assert "gyroscope' is set to /left/image_rect" in missing(named, gyroscope="/left/image_rect")
 
 
 @pytest.mark.parametrize(("rates", "wrong"), [
@@ -224,7 +218,7 @@ def test_a_gyroscope_needs_accelerations(tmp_path):
 
     path = written(tmp_path / "log.mcap", drive(seconds=2), beside)
     assert read(path)[2] == ""
-    assert "/imu0 has no accelerations to go with the rates" in missing(path, McapSource(gyroscope=IMU))
+    assert "/imu0 has no accelerations to go with the rates" in missing(path, gyroscope=IMU)
 
 
 def test_accelerations_need_no_covariance():
@@ -241,16 +235,15 @@ def test_an_inclinometer_may_log_three_accelerations(tmp_path, field, sign):
     def accelerations(number, stamp, rate, force):
         x, y, z = (sign * force).tolist()
         vector = make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
-        return {
-            "/inclinometer": make("geometry_msgs/msg/Vector3Stamped", header=header(stamp, "imu_link"), vector=vector)
-        }
+        logged = make("geometry_msgs/msg/Vector3Stamped", header=header(stamp, "imu_link"), vector=vector)
+        return {"/inclinometer": logged}
 
     path = written(tmp_path / "log.mcap", driven, accelerations)
     assert "whose numbers have no defined meaning; set 'pitch', 'roll'" in missing(path)
     tilts, _, note = read(path, McapSource(accelerations=AccelerationField(field, sign)))
     assert driven.errors(tilts[:400]).max() < 0.5
     assert "the direction of each acceleration on /inclinometer, right only at rest" in note
-    assert "has no field 'angles.x'" in missing(path, McapSource(accelerations=AccelerationField("angles")))
+    assert "has no field 'angles.x'" in missing(path, accelerations=AccelerationField("angles"))
 
 
 def test_an_imu_without_rates_gives_the_direction_of_each_acceleration(tmp_path):

@@ -32,10 +32,8 @@ def test_right_images_logged_late_belong_to_the_frames_of_their_stamps(sample, t
 
 
 def test_a_run_pairs_right_images_that_were_logged_late(traverse, tmp_path):
-    right = "/stereo/right/image_rect"
-    path = rewrite(
-        traverse, tmp_path / "log.mcap", time=lambda topic, at: at + (1_400_000_000 if topic == right else 0)
-    )
+    late = {"/stereo/right/image_rect": 1_400_000_000}
+    path = rewrite(traverse, tmp_path / "log.mcap", time=lambda topic, at: at + late.get(topic, 0))
     assert roverflow("run", path, "-p", "fast", *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd") == 0
 
 
@@ -50,8 +48,7 @@ def test_messages_recorded_twice_are_read_once(sample, whole, tmp_path, later):
         return at + (later if again else 0)
 
     path = rewrite(path, tmp_path / "twice.mcap", time=time)
-    events = items_of(path)
-    assert essences(events) == essences(whole)
+    assert essences(items_of(path)) == essences(whole)
 
 
 def test_another_image_with_the_same_stamp_is_no_repetition(tmp_path):
