@@ -34,16 +34,11 @@ _TYPES = (
     "geometry_msgs/Point[3]", "geometry_msgs/Point[]", "float32[0]", "uint8[-1]", "sensor_msgs/Image", "no_msgs/None",
 )  # fmt: skip
 _TOPICS = (
-    "",
-    "/",
-    "/tf",
-    "/tf_static",
-    "\0",
-    "x" * 5000,
-    "/stereo/left/image_rect",
-    "/stereo/right/camera_info",
-    "é\n",
-)
+    "", "/", "/tf", "/tf_static", "\0", "x" * 5000, "/stereo/left/image_rect", "/stereo/right/camera_info", "é\n",
+)  # fmt: skip
+_KINDS = (
+    "", "/", "a/b/c/d", "sensor_msgs/msg/Imu", "sensor_msgs/msg/CameraInfo", "foxglove.RawImage", "x" * 5000,
+)  # fmt: skip
 
 
 def mutated_bytes(chance: Random, content: bytes) -> bytes:
@@ -171,16 +166,7 @@ def _register(chance: Random | None, writer: Writer, schema: object, channel: ob
         elif kind == 6:
             message_encoding = chance.choice(("cdr", "ros1", "protobuf", "json", "", "é"))
         else:
-            names = (
-                "",
-                "/",
-                "a/b/c/d",
-                "sensor_msgs/msg/Imu",
-                "sensor_msgs/msg/CameraInfo",
-                "foxglove.RawImage",
-                "x" * 5000,
-            )
-            name = chance.choice(names)
+            name = chance.choice(_KINDS)
             encoding = chance.choice((encoding, "ros2msg", "ros2idl", "ros1msg", "protobuf", "jsonschema", ""))
     known = writer.register_schema(name, encoding, text) if chance is None or chance.random() > 0.05 else 0
     return writer.register_channel(topic, message_encoding, known)

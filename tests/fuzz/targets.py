@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import yaml
+from mcap.writer import CompressionType
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 
@@ -97,8 +98,7 @@ def _read_metadata(path: Path) -> None:
 
 
 def _read_image(path: Path) -> None:
-    message = SimpleNamespace(format="jpeg", data=np.frombuffer(path.read_bytes(), np.uint8))
-    pixels_of(message)
+    pixels_of(SimpleNamespace(format="jpeg", data=np.frombuffer(path.read_bytes(), np.uint8)))
 
 
 def _read_video(path: Path) -> None:
@@ -120,17 +120,18 @@ def _read_calibration(path: Path) -> None:
     read_events(log, McapSource(calibration=(str(path),)))
 
 
+def _read_rig(path: Path) -> None:
+    read_rig(path, list(Rig.__dataclass_fields__))
+
+
 def _read_images_calibration(path: Path) -> None:
     import_images([path], [path], path, path.with_suffix(".mcap"), pitch_down=0.0, height=1.0)
 
 
 def _layouts(folder: Path) -> list[bytes]:
-    sample = write_sample(folder / "sample.mcap")
-    return [
-        rewrite(sample, folder / f"{name}.mcap", **layout).read_bytes()
-        for name, layout in LAYOUTS.items() if name != "no crcs"
-    ] + [rewrite(sample, folder / "plain.mcap", compression=LAYOUTS["no compression"]["compression"], enable_crcs=False,
-                 chunk_size=2000).read_bytes()]  # fmt: skip
+    sample, layouts = write_sample(folder / "sample.mcap"), dict(LAYOUTS)
+    layouts["no crcs"] |= {"compression": CompressionType.NONE, "chunk_size": 2000}
+    return [rewrite(sample, folder / f"{name}.mcap", **layout).read_bytes() for name, layout in layouts.items()]
 
 
 def _encodings(folder: Path) -> list[bytes]:
@@ -195,15 +196,8 @@ TARGETS = {
     "pipelines": Target(_pipelines, mutated_text, lambda path: load(str(path)), ".yaml"),
     "calibrations": Target(_calibrations, mutated_text, _read_calibration, ".yaml"),
     "joints": Target(lambda folder: [MAST.encode()], mutated_text, read_joints, ".yaml"),
-    "rigs": Target(
-        lambda folder: [RIG.encode()],
-        mutated_text,
-        lambda path: read_rig(path, list(Rig.__dataclass_fields__)),
-        ".yaml",
-    ),
-    "images calibration": Target(
-        lambda folder: [CALIBRATION.encode()], mutated_text, _read_images_calibration, ".yaml"
-    ),
+    "rigs": Target(lambda folder: [RIG.encode()], mutated_text, _read_rig, ".yaml"),
+    "images calibration": Target(lambda _: [CALIBRATION.encode()], mutated_text, _read_images_calibration, ".yaml"),
     "folders": Target(folders.seeds, folders.mutated, folders.read, ".folder"),
     "metadata": Target(_metadata, mutated_text, _read_metadata, ".yaml"),
 }

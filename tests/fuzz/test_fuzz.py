@@ -14,31 +14,18 @@ def test_changed_files_are_read_or_refused_in_one_sentence(name, tmp_path):
     assert set(faults.values()) == {""}
 
 
-def _refuses():
-    raise LogError("the file is damaged")
+def raising(error):
+    def work():
+        raise error
 
-
-def _fails():
-    raise KeyError("stamp")
-
-
-def _fills_the_memory():
-    return bytearray(600_000_000)
-
-
-def _answers():
-    return []
+    return work
 
 
 @pytest.mark.parametrize(("work", "fault"), [
-    (_refuses, ""), (_fails, "KeyError"), (_fills_the_memory, "took"), (_answers, ""),
-], ids=["refusal", "another exception", "much memory", "result"])  # fmt: skip
+    (raising(LogError("the file is damaged")), ""), (list, ""), (raising(KeyError("stamp")), "KeyError: \"'stamp'\""),
+    (lambda: bytearray(600_000_000), "took "), (raising(LogError), "LogError without a sentence"),
+], ids=["refusal", "result", "another exception", "much memory", "refusal without a sentence"])  # fmt: skip
 def test_only_refusals_and_results_are_no_findings(work, fault):
-    assert isolated(work).fault.partition(":")[0].partition(" ")[0] == fault
-
-
-def test_a_refusal_without_a_sentence_is_a_finding():
-    def refuses():
-        raise LogError
-
-    assert isolated(refuses).fault == "LogError without a sentence"
+    found = isolated(work).fault
+    assert found.startswith(fault)
+    assert bool(found) == bool(fault)

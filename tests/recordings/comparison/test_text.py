@@ -16,12 +16,5 @@ def test_a_single_pixel_or_cell_is_in_the_singular():
 def test_a_fact_of_several_lines_has_a_line_for_each_of_the_first_ten():
     long = "\n".join(map(str, range(12)))
     text = format_diff(Diff(facts={"version": ("1", ""), "pipeline": ("a\nb", long)}))
-    shown = [f"  B {number}" for number in range(10)]
-    assert text.splitlines()[:-1] == [
-        "version: A 1 | B -",
-        "pipeline:",
-        "  A a",
-        "  A b",
-        *shown,
-        "  B and 2 more lines",
-    ]
+    shown = ["version: A 1 | B -", "pipeline:", "  A a", "  A b", *(f"  B {number}" for number in range(10))]
+    assert text.splitlines()[:-1] == [*shown, "  B and 2 more lines"]

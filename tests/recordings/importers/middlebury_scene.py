@@ -52,15 +52,9 @@ def calibration(**changes: object) -> str:
     """calib.txt, with values changed, or left out where None."""
     values = {
         "cam0": f"[{FOCAL:g} 0 40.25; 0 {FOCAL:g} 30; 0 0 1]",
-        "cam1": f"[{FOCAL:g} 0 {40.25 + DOFFS:g}; 0 {FOCAL:g} 30; 0 0 1]",
-        "doffs": f"{DOFFS:g}",
-        "baseline": f"{BASELINE:g}",
-        "width": WIDTH,
-        "height": HEIGHT,
-        "ndisp": NDISP,
-        "isint": 0,
-        **changes,
-    }
+        "cam1": f"[{FOCAL:g} 0 {40.25 + DOFFS:g}; 0 {FOCAL:g} 30; 0 0 1]", "doffs": f"{DOFFS:g}",
+        "baseline": f"{BASELINE:g}", "width": WIDTH, "height": HEIGHT, "ndisp": NDISP, "isint": 0, **changes,
+    }  # fmt: skip
     return "".join(f"{name}={value}\n" for name, value in values.items() if value is not None)
 
 

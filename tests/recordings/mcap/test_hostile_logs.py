@@ -25,9 +25,23 @@ from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
 from tests.recordings import sample_log
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
-from tests.recordings.sample_log import LEFT, START, TILT, changed, compressed, essences, items_of, sound, write_sample
+from tests.recordings.sample_log import (
+    LEFT,
+    START,
+    TILT,
+    changed,
+    compressed,
+    essences,
+    items_of,
+    losses_in,
+    missing_in,
+    sound,
+    write_sample,
+)
 
 NOTHING = b"\0\1\0\0" + bytes(8)
+EMPTY = f"x'{NOTHING.hex()}'"  # in SQL
+PLAIN = {"compression": CompressionType.NONE}
 MILLISECOND = 1_000_000
 
 
@@ -68,15 +82,19 @@ def packed(megabytes: int, states_size: bool) -> bytes:
     return b"".join(packer.compress(bytes(1 << 20)) for _ in range(megabytes)) + packer.flush()
 
 
-def many_messages(writer: Writer, channels: dict[str, int], count: int, topic: str = "", apart: int = 1) -> None:
-    """Messages of a known topic, or of one of their own. apart: ns."""
-    if topic:
-        channel = channels[topic]
-    else:
-        schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
-        channel = writer.register_channel("/tiny", "cdr", schema)
-    for number in range(count):
-        writer.add_message(channel, START + number * apart, NOTHING, START)
+def tiny(count: int, topic: str = "", apart: int = 1, **options: Any) -> Callable[[Path], Path]:
+    """The sample log with many messages more, of a known topic, or of one of their own. apart: ns."""
+
+    def many_messages(writer: Writer, channels: dict[str, int]) -> None:
+        channel = channels[topic] if topic else writer.register_channel("/tiny", "cdr", number_schema(writer))
+        for number in range(count):
+            writer.add_message(channel, START + number * apart, NOTHING, START)
+
+    return with_extra(many_messages, **options)
+
+
+def number_schema(writer: Writer) -> int:
+    return writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
 
 
 def many_topics(writer: Writer, channels: dict[str, int], count: int) -> None:
@@ -88,7 +106,7 @@ def many_topics(writer: Writer, channels: dict[str, int], count: int) -> None:
 
 
 def large_channels(writer: Writer, channels: dict[str, int], count: int) -> None:
-    schema = writer.register_schema("std_msgs/msg/Float64", "ros2msg", b"float64 data\n")
+    schema = number_schema(writer)
     for number in range(count):
         writer.register_channel(f"/large/{number}", "cdr", schema, metadata={"x": "y" * 100_000})
 
@@ -172,28 +190,18 @@ LARGE = {
     "20000 topics": lambda: with_extra(lambda *to: many_topics(*to, 20_000)),
     "channels of 200 MB": lambda: with_extra(lambda *to: large_channels(*to, 2000)),
     "chunk of 2 GB": lambda: with_extra(messages_of(bytes(2000 << 20), 1), chunk_size=1 << 31),
-    "6 million messages": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000)),
-    "6 million messages in a database": lambda: database(
-        6_000_000, f"x'{NOTHING.hex()}'", "/tiny", "std_msgs/msg/Float64"
-    ),
-    "messages of 200 MB in chunks": lambda: with_extra(
-        messages_of(bytes(200 << 20), 20), compression=CompressionType.NONE
-    ),
+    "messages of 200 MB in chunks": lambda: with_extra(messages_of(bytes(200 << 20), 20), **PLAIN),
     "messages of 200 MB outside chunks": lambda: with_extra(messages_of(bytes(200 << 20), 20), use_chunking=False),
     "database with messages of 120 MB": lambda: database(20, "zeroblob(120000000)"),
-    "2 million messages in one chunk": lambda: with_extra(
-        lambda *to: many_messages(*to, 2_000_000), chunk_size=1 << 31
-    ),
-    "6 million messages outside chunks": lambda: with_extra(
-        lambda *to: many_messages(*to, 6_000_000), use_chunking=False
-    ),
-    "6 million messages in use": lambda: with_extra(lambda *to: many_messages(*to, 6_000_000, TILT)),
-    "6 million messages in use outside chunks": lambda: with_extra(
-        lambda *to: many_messages(*to, 6_000_000, TILT), use_chunking=False
-    ),
+    "2 million messages in one chunk": lambda: tiny(2_000_000, chunk_size=1 << 31),
+    "6 million messages": lambda: tiny(6_000_000),
+    "6 million messages outside chunks": lambda: tiny(6_000_000, use_chunking=False),
+    "6 million messages in a database": lambda: database(6_000_000, EMPTY, "/tiny", "std_msgs/msg/Float64"),
+    "6 million messages in use": lambda: tiny(6_000_000, TILT),
+    "6 million messages in use outside chunks": lambda: tiny(6_000_000, TILT, use_chunking=False),
     "6 million messages in use in a bag": lambda: bag_in_use(6_000_000, has_index=True),
     "6 million messages in use in a bag without an index": lambda: bag_in_use(6_000_000, has_index=False),
-    "6 million messages in use in a database": lambda: database(6_000_000, f"x'{NOTHING.hex()}'", TILT),
+    "6 million messages in use in a database": lambda: database(6_000_000, EMPTY, TILT),
 }
 
 
@@ -204,8 +212,8 @@ def test_a_hostile_log_costs_little(tmp_path, name):
 
 
 IN_USE = {
-    "chunks": lambda: with_extra(lambda *to: many_messages(*to, 1_000_000, TILT, MILLISECOND)),
-    "a database": lambda: database(1_000_000, f"x'{NOTHING.hex()}'", TILT, apart=MILLISECOND),
+    "chunks": lambda: tiny(1_000_000, TILT, MILLISECOND),
+    "a database": lambda: database(1_000_000, EMPTY, TILT, apart=MILLISECOND),
 }
 
 
@@ -238,48 +246,45 @@ def test_a_log_that_unpacks_to_far_more_than_its_size_is_refused(tmp_path, monke
 
 
 def test_a_topic_faster_than_any_sensor_is_refused_unless_a_setting_allows_it(tmp_path, whole):
-    path = with_extra(lambda *to: many_messages(*to, 20, TILT, MILLISECOND))(tmp_path)
-    with McapSource(max_rate=2).open(path) as log:
-        assert "/imu/data: over 20 of its 25 messages were logged within 10 s" in log.missing["inclinometer"]
-        assert "set 'max_rate' of the source to the rate of the sensor" in log.missing["inclinometer"]
+    path = tiny(20, TILT, MILLISECOND)(tmp_path)
+    why = missing_in(path, max_rate=2)["inclinometer"]
+    assert "/imu/data: over 20 of its 25 messages were logged within 10 s" in why
+    assert "set 'max_rate' of the source to the rate of the sensor" in why
     with McapSource(max_rate=3).open(path) as log:
         assert sound(log.events()) == essences(whole)
 
 
-def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tmp_path, monkeypatch):
-    def shuffled(rows):
-        return rows[::3] + rows[1::3] + rows[2::3]
-
-    path = rewrite(sample, tmp_path / "log.mcap", order=shuffled, chunk_size=3000)
-    times = []
-    unpack = McapFile._unpacked
+@pytest.fixture
+def unpacked(monkeypatch):
+    """The chunks that are unpacked, each time that they are."""
+    times, unpack = [], McapFile._unpacked
     monkeypatch.setattr(McapFile, "_unpacked", lambda self, one: times.append(one) or unpack(self, one))
+    return times
+
+
+def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tmp_path, monkeypatch, unpacked):
+    shuffled = rewrite(
+        sample, tmp_path / "log.mcap", order=lambda rows: rows[::3] + rows[1::3] + rows[2::3], chunk_size=3000
+    )
     counts = []
     for limit in (1 << 28, 1):
         monkeypatch.setattr(message_order, "MAX_OPEN_BYTES", limit)
-        times.clear()
-        events = items_of(path)
-        assert essences(events) == essences(whole)
-        counts.append(len(times))
+        unpacked.clear()
+        assert essences(items_of(shuffled)) == essences(whole)
+        counts.append(len(unpacked))
     assert counts[1] > counts[0]
 
 
-def test_a_chunk_that_was_just_read_is_not_unpacked_again(sample, monkeypatch):
-    times = []
-    unpack = McapFile._unpacked
-    monkeypatch.setattr(McapFile, "_unpacked", lambda self, one: times.append(one) or unpack(self, one))
+def test_a_chunk_that_was_just_read_is_not_unpacked_again(sample, unpacked):
     with McapFile(sample) as file:
-        assert [[*file.messages({number})] for number in file.channels] == [
-            [*file.messages({number})] for number in file.channels
-        ]
-        assert len(times) == len(file.index.chunks)
+        once, again = ([[*file.messages({number})] for number in file.channels] for _ in range(2))
+        assert once == again
+        assert len(unpacked) == len(file.index.chunks)
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])
 def test_a_message_that_no_recorder_writes_is_lost_alone(tmp_path, whole, use_chunking):
-    layout = {"use_chunking": use_chunking, "compression": CompressionType.NONE}
-    path = with_extra(messages_of(bytes(140 << 20), 1), **layout)(tmp_path)
-    found = items_of(path)
-    lost = [str(item) for _, _, item in found if isinstance(item, LogError)]
-    assert lost == [f"{LEFT}: the message has 146800640 bytes; the limit is 134217728"]
+    found = items_of(with_extra(messages_of(bytes(140 << 20), 1), use_chunking=use_chunking, **PLAIN)(tmp_path))
+    ((_, _, why),) = losses_in(found)
+    assert why == f"{LEFT}: the message has 146800640 bytes; the limit is 134217728"
     assert sound(found) == essences(whole)

@@ -128,17 +128,12 @@ def test_an_image_of_another_size_is_refused_before_decoding(suffix, optimize, m
 
 @pytest.mark.parametrize(("first", "known"), [(0.25, True), (0.0, False), (-1.0, False)])
 def test_a_zero_or_negative_covariance_is_none(first, known):
-    origin = {"position": make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)}
+    point = make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
     turn = make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0)
-    pose = make(
-        "geometry_msgs/msg/PoseWithCovarianceStamped",
-        header=header(5, "odom"),
-        pose=make(
-            "geometry_msgs/msg/PoseWithCovariance",
-            pose=make("geometry_msgs/msg/Pose", **origin, orientation=turn),
-            covariance=np.diag([first] * 6).reshape(-1),
-        ),
-    )
-    found = pose_of(pose, 5, "base_link")
+    known_to = {"pose": make("geometry_msgs/msg/Pose", position=point, orientation=turn)}
+    known_to["covariance"] = np.diag([first] * 6).reshape(-1)
+    pose = make("geometry_msgs/msg/PoseWithCovariance", **known_to)
+    stamped = make("geometry_msgs/msg/PoseWithCovarianceStamped", header=header(5, "odom"), pose=pose)
+    found = pose_of(stamped, 5, "base_link")
     assert found is not None
     assert (found.covariance is not None) == known

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pytest
 
 from recordings.sinks.colormaps import (
     REASON_LEGEND,
@@ -15,6 +16,11 @@ from recordings.sinks.colormaps import (
 )  # fmt: skip
 from stages.data import LEVEL_FRAME, CellReason, ElevationMap, PixelOrigin, VoxelMap
 from tests.recordings.sinks.recorded_scene import START, Record, entities, record_of, rows, scene
+
+
+def labels_of(recording, layer):
+    """The labels beside the scale of a layer of the elevation map."""
+    return rows(recording, f"/elevation_map/layers/{layer}/scale/text", "Points2D:labels")[0][2]
 
 
 def test_a_map_that_a_later_map_contains_is_not_drawn_twice(tmp_path):
@@ -61,11 +67,7 @@ def test_slopes_are_drawn_in_degrees_as_their_limits_are_given(tmp_path):
     terrain = scene()["elevation_map"]
     layers = {"elevation": terrain.layers["elevation"], "slope": np.full(terrain.shape, np.radians(20.0), np.float32)}
     path = record_of(tmp_path / "a.rrd", [Record(START, {"elevation_map": replace(terrain, layers=layers)})])
-    assert rows(path, "/elevation_map/layers/slope/scale/text", "Points2D:labels")[0][2] == [
-        "0 deg",
-        "20 deg",
-        "40 deg",
-    ]
+    assert labels_of(path, "slope") == ["0 deg", "20 deg", "40 deg"]
     buffer = np.array(rows(path, "/elevation_map/layers/slope", "DepthImage:buffer")[0][2][0], np.uint8)
     np.testing.assert_allclose(buffer.view(np.float16), 20.0, atol=0.02)
 
@@ -75,22 +77,15 @@ def test_the_scale_of_a_layer_shows_the_limit_of_the_hazard_rule(tmp_path):
     layers = dict.fromkeys(("elevation", "step"), terrain.layers["elevation"])
     items = {"elevation_map": replace(terrain, layers=layers)}
     path = record_of(tmp_path / "a.rrd", [Record(START, items)], limits=("elevation_map/step=0.17", "other/step=0.3"))
-    assert rows(path, "/elevation_map/layers/step/scale/text", "Points2D:labels")[0][2] == [
-        "0 m",
-        "limit 0.17 m",
-        "0.4 m",
-    ]
+    assert labels_of(path, "step") == ["0 m", "limit 0.17 m", "0.4 m"]
     shown = rows(path, "/elevation_map/layers/step/scale", "Points2D:colors")[0][2][1]
     (expected,) = apply_palette(np.array([0.17]), 0.0, 0.4, cv2.COLORMAP_TURBO).tolist()
     assert [shown >> 24, shown >> 16 & 255, shown >> 8 & 255] == expected
 
 
 def test_a_run_gives_the_limits_of_its_hazard_rule(result):
-    def scale(layer):
-        return rows(result.with_suffix(".rrd"), f"/elevation_map/layers/{layer}/scale/text", "Points2D:labels")[0][2][1]
-
     expected = {"step": "limit 0.17 m", "slope": "limit 20 deg", "roughness": "limit 0.06 m"}
-    assert {layer: scale(layer) for layer in expected} == expected
+    assert {layer: labels_of(result.with_suffix(".rrd"), layer)[1] for layer in expected} == expected
 
 
 def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path):
@@ -105,14 +100,10 @@ def test_voxels_are_boxes_at_the_centres_of_their_cubes(tmp_path):
     np.testing.assert_allclose(halves, 0.05)
 
 
-def test_every_reason_has_a_colour_of_its_own():
-    assert set(REASON_LEGEND) == set(CellReason)
-    assert len({colour for _, colour in REASON_LEGEND.values()}) == len(REASON_LEGEND)
-
-
-def test_every_pixel_origin_has_a_colour_of_its_own():
-    assert set(SOURCE_LEGEND) == set(PixelOrigin)
-    assert len({colour for _, colour in SOURCE_LEGEND.values()}) == len(SOURCE_LEGEND)
+@pytest.mark.parametrize(("codes", "legend"), [(CellReason, REASON_LEGEND), (PixelOrigin, SOURCE_LEGEND)])
+def test_every_code_has_a_colour_of_its_own(codes, legend):
+    assert set(legend) == set(codes)
+    assert len({colour for _, colour in legend.values()}) == len(legend)
 
 
 def test_a_regional_map_shows_which_frames_it_is_made_of(tmp_path):
@@ -126,4 +117,4 @@ def test_a_regional_map_shows_which_frames_it_is_made_of(tmp_path):
     values = buffer.view(np.float16)
     assert set(values[np.isfinite(values)]) == {3}
     assert 0 < np.isnan(values).mean() < 1
-    assert rows(path, "/elevation_map/layers/frames/scale/text", "Points2D:labels")[0][2][2] == "20 frames"
+    assert labels_of(path, "frames")[2] == "20 frames"
