@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.containers.container import LostMessage
+from recordings.containers.container import LostMessage, RawMessage
 from recordings.inventory.search_range import search_range
 from recordings.scoring.result_log import about_run, pipeline_of
-from recordings.source.cameras import CAMERAS
+from recordings.source.cameras import CAMERAS, CalibrationHistory
 from recordings.source.log import McapLog
+from recordings.source.topics import attempt
 from stages.data import StereoCamera, Tilt
 
 MAX_VERIFIED_BYTES = 300_000_000  # of a log whose messages are all read; it takes a second
+LAST_CALIBRATIONS = 20  # of a large log, that are read
 Stamps = NDArray[np.int64]
 
 
@@ -30,7 +32,7 @@ class Damage(dict[str, tuple[int, str]]):
         if not re.search(r" at \d+ ns\b", sentence):  # of the log
             self[sentence] = 1, sentence
             return
-        alike = re.sub(r"(?<=[\s\[])-?\d[\d.e+-]*", "", sentence)
+        alike = re.sub(r"(?<=[\s\[(])-?\d[\d.e+-]*", "", sentence)
         count, first = self.get(alike, (0, sentence))
         self[alike] = count + 1, first
 
@@ -55,7 +57,9 @@ def describe(
     delays, of_tilts = array("q"), array("q")
     stamps = {stream: _stamps(log, stream, damage, delays if stream == "left" else None) for stream in CAMERAS}
     stamps["inclinometer"] = _tilts(log, damage, of_tilts)
-    left, right, tilts = (_distinct(log, stream, damage, stamps[stream]) for stream in stamps)
+    distinct = {stream: _distinct(log, stream, damage, stamps[stream]) for stream in stamps}
+    left, right = (_calibrated(log, side, damage, distinct[side]) for side in CAMERAS)
+    tilts = distinct["inclinometer"]
     max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
     return {
         "path": str(log.path),
@@ -168,6 +172,26 @@ def _distinct(log: McapLog, stream: str, damage: Damage, stamps: Stamps) -> Stam
         what = f"{repeated} of {len(stamps)} messages repeat a stamp; a run drops them"
         damage.add(f"{log.topics[stream]}: {what}")
     return distinct
+
+
+def _calibrated(log: McapLog, side: str, damage: Damage, stamps: Stamps) -> Stamps:
+    """The stamps of images that the log's first calibration is for; the others are noted in `damage`.
+
+    Of a large log only the last calibrations are read.
+    """
+    if side not in log.resolution.infos:
+        return stamps
+    info, messages = log.resolution.infos[side], log.resolution.messages
+    history, channels = CalibrationHistory(info.model), messages.channels_of(info.topic)
+    first = None if _is_verified(log) else min(log.file.times(channels)[-LAST_CALIBRATIONS:], default=None)
+    for raw in log.file.messages(channels, first):
+        if isinstance(raw, RawMessage):
+            attempt(lambda raw: history.note(messages.decoders[raw.channel](raw.data), raw.log_time), raw)
+    errors = {stamp: attempt(history.check, stamp) for stamp in stamps.tolist()}
+    for stamp, error in errors.items():
+        if error is not None:
+            damage.add(f"{log.topics[side]} at {stamp} ns: {error}")
+    return np.array([stamp for stamp, error in errors.items() if error is None], np.int64)
 
 
 def _pairs(left: Stamps, right: Stamps, slop: int) -> int:

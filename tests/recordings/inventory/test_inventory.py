@@ -101,6 +101,17 @@ def test_repeated_stamps_count_once_and_are_reported(tmp_path):
     assert described["damage"] == [f"{topic}: {sentence}" for topic in (LEFT, RIGHT, TILT)]
 
 
+@pytest.mark.parametrize("verified_bytes", [1 << 30, 0])
+def test_images_of_a_second_camera_on_a_topic_are_not_usable(tmp_path, monkeypatch, verified_bytes):
+    monkeypatch.setattr("recordings.inventory.description.MAX_VERIFIED_BYTES", verified_bytes)
+    path = write_sample(tmp_path / "log.mcap", changed(INFOS[0], {"k": lambda k: k * np.geomspace(1, 2, 9)}, [1, 3]))
+    described = inventory_of(path)
+    assert (described["frames"]["left"], described["frames"]["pairs"]) == (FRAMES, FRAMES - 2)
+    (damage,) = described["damage"]
+    why = "the calibration differs from the log's first one, so the image cannot be used"
+    assert damage.startswith(f"2 similar, first: {LEFT} at {START + PERIOD} ns: {why}; cut the log in two where it ")
+
+
 def test_without_cameras_no_pairs_are_reported(tmp_path):
     text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", dropped(*INFOS))))
     assert "missing: left: no CameraInfo belongs to" in text
