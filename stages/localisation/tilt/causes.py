@@ -157,11 +157,11 @@ def _right_angles() -> Array:
 
 
 def wrong_mount(fit: Fit) -> Cause:
-    """The rotation missing from the mount, by Gauss-Newton from the best of the right angles."""
+    """The rotation missing from the mount, by Gauss-Newton from the best right angle of the inclinometer or camera."""
     from scipy.spatial.transform import Rotation  # takes long to import
 
     mount = fit.evidence.mount
-    starts = [mount @ turn @ mount.T for turn in _right_angles()]
+    starts = [*(mount @ turn @ mount.T for turn in _right_angles()), *_right_angles()]
     cost = [fit.misfit(fit.ups @ s.T) + fit.slope(fit.ups @ s.T) for s in starts]
     turn = starts[int(np.argmin(cost))] if min(cost) < 0.25 * cost[0] else np.eye(3)
     for _ in range(8):

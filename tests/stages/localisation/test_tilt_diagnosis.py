@@ -83,6 +83,12 @@ def test_a_wrong_mount_is_named_with_its_correction(drive, turned):
 
 
 @pytest.mark.parametrize("drive", DRIVES)
+def test_a_camera_that_hangs_upside_down_is_a_wrong_mount(drive):
+    found = diagnose(drive.evidence(turned=drive.mount.T @ about("z", 180) @ drive.mount))
+    assert re.match(r"the mount of the inclinometer is wrong by 1(79\..|80\.0) degrees", found.fault), found.sentence
+
+
+@pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("late", [0.2, -0.2])
 def test_a_time_offset_is_named_with_its_size(drive, late):
     found = diagnose(drive.evidence(late=late))
