@@ -181,8 +181,8 @@ def _right_in_left(names: tuple[str, str], tree: TransformTree) -> Transform:
     if abs(translation[0]) < 0.9 * np.linalg.norm(translation):
         raise LogError(
             f"the static transform '{right_in_left.parent}' <- '{right_in_left.child}' has the right camera at "
-            f"{translation.tolist()} m, not beside the left one: these are not optical frames (x right, y down, "
-            "z forward); name optical frames in CameraInfo"
+            f"{translation.round(3).tolist()} m, not beside the left one: these are not optical frames (x right, "
+            "y down, z forward); name optical frames in CameraInfo"
         )
     return right_in_left
 

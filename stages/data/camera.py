@@ -161,7 +161,7 @@ class StereoCamera:
             if not 0.2 * extent <= getattr(self, name) <= 0.8 * extent:
                 outer = f"{name} of {getattr(self, name):g} px lies in the outer fifth of {size} images"
                 doubts.append(f"{outer}: check that the calibration is for this size")
-        if self.baseline > 5:
+        if not 0.005 <= self.baseline <= 5:
             doubts.append(f"the baseline is {self.baseline:g} m: check that it is given in metres")
         return tuple(doubts)
 

@@ -127,7 +127,7 @@ class Rectify(Stage):
             swapped = (
                 f"{offset.crossed:.0%} of the features that both images show look farther than infinity: left and "
                 "right are swapped, or the calibration is not that of these images; exchange 'left' and 'right' of the "
-                "source"
+                "source, and set 'left_info' and 'right_info' to the topics that they have now"
             )
             return replace(self, row_offset=0.0), Finding(swapped, Severity.FAULT, about="cameras")
         terms = tuple(round(term, 4) for term in offset.terms)

@@ -246,6 +246,7 @@ def test_a_survey_finds_swapped_and_unrectified_images(rows, swapped, words):
     _, found = Rectify().survey([StereoFrame(1, *pair, CAMERA)])
     assert words in found.sentence
     assert ("swapped" in found.sentence, "at the centre" in found.sentence) == (swapped, not swapped)
+    assert ("set 'left_info' and 'right_info' to the topics that they have now" in found.sentence) == swapped
     assert (found.severity, found.about) == (("fault", "cameras") if swapped else ("warning", ""))
 
 
@@ -277,6 +278,7 @@ def test_a_pair_with_negative_disparities_is_shifted_above_zero(row_offset):
     ({"cx": 120.0, "cx_right": 320.0}, "cx of 120 px lies in the outer fifth of 640x480 images: check that"),
     ({"cy": 400.0}, "cy of 400 px lies in the outer fifth of 640x480 images: check that"),
     ({"baseline": 12.0}, "the baseline is 12 m: check that it is given in metres; "),
+    ({"baseline": 0.0008}, "the baseline is 0.0008 m: check that it is given in metres; "),
 ])  # fmt: skip
 def test_an_implausible_calibration_is_a_warning(changes, words):
     frame = StereoFrame(1, *a_pair((1.0,), size=LARGE), CAMERA)
