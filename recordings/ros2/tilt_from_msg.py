@@ -24,6 +24,7 @@ Vector = tuple[float, float, float]
 
 MIN_ACCELERATION = 0.1  # m/s^2; less contains no gravity
 MAX_STATED_SIGMA = np.radians(20.0)  # beyond it a covariance says only that the driver does not know
+_MAX_PLACES = 100  # of an array of numbers, that a field may be
 
 
 def tilt_of(message: Any, log_time: int) -> Tilt:
@@ -159,16 +160,18 @@ def _number(message: Any, path: str) -> float:
             known = ", ".join(known for known in names if not known.startswith("_"))
             where = f"{_kind(value)} (it has {known})" if known else _kind(value)
             raise LogError(f"the message has no field '{path}': no '{name}' in its {where}")
-        value = getattr(value, name)
+        value = value[int(name)] if name.isdecimal() else getattr(value, name)
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise LogError(f"field '{path}' contains a {_kind(value)}, which is not a number")
     return float(value)
 
 
 def _field_names(value: Any) -> list[str]:
-    """The names of a message's fields, in any encoding."""
+    """The names of a message's fields, in any encoding; of an array the places of its numbers."""
     if hasattr(value, "DESCRIPTOR"):  # protobuf
         return [known.name for known in value.DESCRIPTOR.fields]
+    if hasattr(value, "__getitem__") and not isinstance(value, str):
+        return [str(place) for place in range(min(len(value), _MAX_PLACES))]
     names: list[str] = [*(getattr(value, "__dataclass_fields__", None) or getattr(value, "__dict__", {}))]
     return names
 

@@ -107,6 +107,14 @@ def test_an_absent_field_of_json_is_refused_with_those_that_are_there():
         AngleField("nod", "deg", 1)(SimpleNamespace(pitch=1.0, roll=2.0))
 
 
+@pytest.mark.parametrize("data", [[1.0, 2.0], np.array([1.0, 2.0])], ids=["list", "array"])
+def test_an_angle_may_be_a_number_of_an_array(data):
+    message = SimpleNamespace(data=data)
+    assert AngleField("data.1", "rad", -1)(message) == -2.0
+    with pytest.raises(LogError, match=r"no '2' in its (list|ndarray) \(it has 0, 1\)"):
+        AngleField("data.2", "rad", 1)(message)
+
+
 @pytest.mark.parametrize("data", [
     b"", b"[1]", b"{", b'{"timestamp": 3}', b"[" * 100_000, b'{"a": [' + b"[]," * 4_000_000,
 ], ids=["empty", "list", "cut", "other type", "deep", "large"])  # fmt: skip
