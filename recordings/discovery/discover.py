@@ -27,6 +27,7 @@ from recordings.source.settings import LogSettings
 from recordings.source.topics import MAX_TRIED, DecodedTopics
 
 _MAX_LISTED = 5  # frames in a sentence
+_NO_POSE = "none"  # the value of the setting 'odometry' by which a run does without the log's pose
 _TRUTH = "/truth/"  # the simulator's ground truth, used only if a setting names it
 
 
@@ -61,12 +62,17 @@ def _find_pose(
     topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
 ) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
+    if settings.odometry == _NO_POSE:
+        found.missing["odometry"] = f"the source's 'odometry' is set to {_NO_POSE}"
+        return
+    moving = [topic for topic in topics if topic.schema == TRANSFORMS and not topic.name.endswith("tf_static")]
     if settings.odometry is not None:
-        moving = [topic for topic in topics if topic.schema == TRANSFORMS and not topic.name.endswith("tf_static")]
         candidates = poses + [topic for topic in moving if topic.messages]
         if settings.odometry not in {topic.name for topic in candidates}:
             found.refuse("odometry", "odometry", not_there("odometry", settings.odometry, "pose", candidates))
-        elif settings.odometry in {topic.name for topic in moving} and (why := _no_pose_reason(messages, settings)):
+        elif settings.odometry in {topic.name for topic in moving} and (
+            why := _no_pose_reason(messages, settings.odometry, settings.base_frame)
+        ):
             found.refuse("odometry", "odometry", f"the source's 'odometry' is set to {settings.odometry}, where {why}")
         else:
             found.chosen["odometry"], found.why["odometry"] = settings.odometry, "as set"
@@ -78,15 +84,16 @@ def _find_pose(
         found.offer("odometry", "odometry", [topic.name for topic in choice])
         found.missing["odometry"] = f"several topics are odometry ({names_of(choice)}); set 'odometry' of the source"
     else:
+        poses += [t for t in moving if t.messages and not _no_pose_reason(messages, t.name, settings.base_frame)]
         other = f" (there is {names_of(poses)}; set 'odometry' of the source to use it)" if poses else ""
         found.offer("odometry", "odometry", [topic.name for topic in poses if not topic.name.startswith(RESULTS)])
         found.missing["odometry"] = f"the log has no nav_msgs/Odometry from a sensor{other}"
 
 
-def _no_pose_reason(messages: DecodedTopics, settings: LogSettings) -> str | None:
-    """Why the transforms on the set topic are not the pose of the base frame; None if they are."""
-    base, parents = settings.base_frame, dict[str, set[str]]()
-    for message in messages.sample(str(settings.odometry), lambda message: message.transforms, MAX_TRIED):
+def _no_pose_reason(messages: DecodedTopics, topic: str, base: str) -> str | None:
+    """Why the transforms on a topic are not the pose of the frame `base`; None if they are."""
+    parents = dict[str, set[str]]()
+    for message in messages.sample(topic, lambda message: message.transforms, MAX_TRIED):
         for item in [] if isinstance(message, LogError) else message:
             parents.setdefault(frame_name(item.child_frame_id), set()).add(frame_of(item))
     if base not in parents:

@@ -132,9 +132,11 @@ class SourceResolution:
         if self.tilt is not None:
             notes.append(("inclinometer", self.tilt.note(estimator, self.source)))
         if self.mount is not None and self.mount.base_from_camera is None:
+            others = self._frames_of_camera()
             notes.append(("mount", (
                 f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
                 "`points.camera_height` (default 1 m) below the camera and x is its viewing direction"
+                + (f"; set 'base_frame' of the source to the rover's frame ({others})" if others else "")
             )))  # fmt: skip
         if self.moving is not None:
             notes.append(("mount", self.moving.note))
@@ -223,14 +225,18 @@ class SourceResolution:
         base = self.source.base_frame
         if base == type(self.source).base_frame or self.mount is None or self.mount.base_from_camera is not None:
             return
-        assert self.cameras is not None  # a mount needs them
-        own = {self.tilt_frame, *(camera.frame_id for camera in self.cameras)}
-        joined = (name for name in self.static.edges if self.static.between(name, self.cameras[0].frame_id) is not None)
-        if others := ", ".join(f"'{name}'" for name in sorted(set(joined) - own)):
+        if others := self._frames_of_camera():
             self.refused["base_frame"] = (
                 f"the source's 'base_frame' is set to '{base}', but /tf_static joins the camera to {others} only; set "
                 "it to one of these, or record how the camera sits on it"
             )
+
+    def _frames_of_camera(self) -> str:
+        """The frames that /tf_static joins to the camera, without those of the sensors."""
+        assert self.cameras is not None  # a mount needs them
+        own = {self.tilt_frame, *(camera.frame_id for camera in self.cameras)}
+        joined = (name for name in self.static.edges if self.static.between(name, self.cameras[0].frame_id) is not None)
+        return ", ".join(f"'{name}'" for name in sorted(set(joined) - own))
 
     def _resolve_pose(self) -> None:
         """Whether the poses can be used: in a fixed frame, of a frame that is joined to the camera."""

@@ -55,7 +55,8 @@ class LogSettings:
     )
     odometry: str | None = parameter(
         None,
-        "topic of an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage that places base_frame",
+        "topic of an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage that places base_frame; none: "
+        "no pose of the log",
     )
     pitch: AngleField | None = parameter(None, "field of the pitch, for an inclinometer with plain angles")
     roll: AngleField | None = parameter(None, "field of the roll, for an inclinometer with plain angles")

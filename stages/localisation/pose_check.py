@@ -53,7 +53,7 @@ class PoseCheck:
             return (
                 f"Logged odometry disagrees with visual odometry: median step {np.median(logged):.2f} m vs "
                 f"{np.median(visual):.2f} m, difference {usual:.2f} m ({len(difference)} steps). Check its frame, its "
-                "heading and its unit, or run without it: visual odometry then supplies the pose."
+                "heading and its unit, or set source.odometry to none: visual odometry then supplies the pose."
             )
         if scale := _scale_problem(visual, logged):
             return scale

@@ -71,7 +71,8 @@ def register(stage: Stage, cloud: PointCloud, pose: Pose, mount: Mount | None = 
     if lean > _MAX_LEAN:
         raise StageError(
             f"{type(stage).__name__}: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off "
-            "the vertical of the tilt; check the tilt, or give a pose in a frame whose z points up"
+            "the vertical of the tilt; check the tilt, give a pose in a frame whose z points up, or set "
+            "source.odometry to none for visual odometry"
         )
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     rotation = turn_about_z(yaw)

@@ -110,6 +110,12 @@ def test_a_pose_among_results_is_named_but_not_used(tmp_path):
         assert log.topics["odometry"] == "/nav/odometry"
 
 
+def test_a_run_may_do_without_the_pose_of_the_log(tmp_path):
+    with McapSource(odometry="none").open(write_sample(tmp_path / "log.mcap")) as log:
+        assert log.missing == {"odometry": "the source's 'odometry' is set to none"}
+        assert log.refused == {}
+
+
 ODOM, MAP, WHEEL = ("odom", "base_link"), ("map", "odom"), ("base_link", "wheel")
 
 
@@ -162,6 +168,8 @@ def test_a_pose_of_a_frame_not_joined_to_the_camera_is_refused(tmp_path, given):
 
 def test_the_pose_may_be_rare_among_other_transforms(tmp_path):
     path = moving(tmp_path / "log.mcap", *[WHEEL] * 50, ODOM, count=20)
+    with McapSource().open(path) as log:
+        assert "there is /tf; set 'odometry' of the source to use it" in log.missing["odometry"]
     with McapSource(odometry="/tf").open(path) as log:
         assert log.topics["odometry"] == "/tf"
         children = lambda message: {item.child_frame_id: item for item in message.transforms}  # noqa: E731

@@ -180,6 +180,9 @@ def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path):
     assert why.startswith("the source's 'base_frame' is set to 'rover', but /tf_static")
     assert "joins the camera to 'base_link' only; set it to one of these" in why
     assert refused_in(log, base_frame="imu_link") == {}
+    of_rover = mounted(*(replace(each, parent="rover") for each in TRANSFORMS))
+    with McapSource().open(write_sample(tmp_path / "rover.mcap", of_rover)) as opened:
+        assert opened.notes()["mount"].endswith("; set 'base_frame' of the source to the rover's frame ('rover')")
     bare = mounted(TRANSFORMS[0].inverse().after(TRANSFORMS[1]))
     with McapSource(base_frame="rover").open(write_sample(tmp_path / "bare.mcap", bare)) as opened:
         assert opened.refused == {}  # the log has no better one
