@@ -1,6 +1,7 @@
 """ROS 1 messages, decoded by the definitions in the log, with the field names of ROS 2.
 
-The codec is rosbags'. ROS 1 names the matrices of a CameraInfo in capitals and has a sequence number in each header.
+The codec is rosbags'. ROS 1 names the matrices of a CameraInfo in capitals, except in bags that were converted from
+ROS 2, and has a sequence number in each header.
 """
 
 from __future__ import annotations
@@ -54,5 +55,5 @@ def _listed_nothings(store: SharedTypestore) -> Iterator[str]:
 
 
 def _camera_info(message: Any) -> Any:
-    fields = {field: getattr(message, field) for field in message.__dataclass_fields__ if not field.startswith("__")}
-    return SimpleNamespace(**fields, **{field.lower(): fields[field] for field in "DKRP"})
+    names = (name for name in message.__dataclass_fields__ if not name.startswith("__"))
+    return SimpleNamespace(**{name.lower(): getattr(message, name) for name in names})

@@ -1,6 +1,7 @@
 """One log in every encoding that is read, and foreign content in each."""
 
 import json
+import re
 import struct
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,12 +26,12 @@ from recordings.mcap import chunk
 from recordings.ros2.cdr import make
 from recordings.ros2.image_from_msg import pixels_of
 from recordings.ros2.tilt_from_msg import AngleField
-from recordings.ros2.to_msg import image
+from recordings.ros2.to_msg import camera_info, image
 from recordings.source.topics import MAX_CHANNELS
 from stages.data import Tilt
 from tests.conftest import write_mcap
-from tests.recordings.encodings.rewritten import WRITERS
-from tests.recordings.sample_log import essences, items_of
+from tests.recordings.encodings.rewritten import ROS1, WRITERS, as_ros1
+from tests.recordings.sample_log import essences, items_of, model
 
 NOTHING = f"c/E[{{}}] x\n{'=' * 80}\nMSG: c/E\n"
 
@@ -135,6 +136,13 @@ def test_json_values_that_no_result_could_contain_are_refused(frame, seconds, se
                  "translation": zero, "rotation": {**zero, "w": 1.0}}  # fmt: skip
     with pytest.raises(LogError, match=sentence):
         decode(json.dumps({"transforms": [transform]}).replace("FRAME", frame).encode())
+
+
+def test_a_calibration_converted_to_ros_1_may_keep_the_names_of_ros_2():
+    info, kind = camera_info(1, "left", model("left")), "sensor_msgs/msg/CameraInfo"
+    text = re.sub(r"(?m)[DKRP]$", lambda name: name[0].lower(), ROS1.generate_msgdef(kind, ros_version=1)[0])
+    _, decode = decoder_of(Channel(1, "/info", "ros1", MessageSchema(kind, "ros1msg", text.encode())))
+    np.testing.assert_array_equal(decode(bytes(ROS1.serialize_ros1(as_ros1(info), kind))).p, info.p)
 
 
 @pytest.mark.parametrize(("encoding", "schema", "sentence"), [
