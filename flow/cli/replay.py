@@ -41,13 +41,9 @@ def replay(
     descriptor that gets the recording while it is written; 0: none; profile: of the result log; desk: layout of the
     recording; None: as the pipeline says; with_inputs: copy the messages of the log into the result log.
     """
-    from tqdm import tqdm
-
     from flow.config import loader as pipelines
     from flow.runtime.interrupts import Stop, interrupts
     from flow.runtime.run import run
-    from recordings.containers.digest import log_digest
-    from recordings.scoring.result_log import names_of
     from stages.kernel_loading import loading_kernels
 
     graph = pipelines.load(pipeline, overrides)
@@ -64,33 +60,52 @@ def replay(
         graph.source.open(log, start=start, end=end) as opened,
         one_thread_per_call(),
     ):
-        about = {
-            "roverflow": product_version(),
-            "pipeline": graph.text,
-            "overrides": "\n".join(overrides),
-            "log": names_of(logs),
-            "log_digest": log_digest(files) if files else "",
-            "start": "" if start is None else repr(float(start)),
-            "end": "" if end is None else repr(float(end)),
-            "every": "" if every is None else str(every),
-            **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
-        }
-        # A file name may hold bytes that are not UTF-8.
-        about = {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
+        about = _about(graph, logs, files, overrides, start, end, every)
         hidden = on_frame is not None or not sys.stderr.isatty()
-        with tqdm(total=_frames(opened.frames, every), unit="frame", disable=hidden) as bar:
-            drops = 0
-
-            def advance(complete: bool) -> None:
-                nonlocal drops
-                drops += not complete
-                bar.set_postfix(dropped=drops, refresh=False)
-                bar.update()
-
-            with interrupts(stop, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)):
-                settings: dict[str, Any] = {"workers": workers, "every": every}
-                summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
+        with _progress_bar(_frames(opened.frames, every), hidden) as (advance, say), interrupts(stop, say):
+            settings: dict[str, Any] = {"workers": workers, "every": every}
+            summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
     return as_json(summary | {"overrides": list(overrides)})
+
+
+def _about(
+    graph: Graph, logs: Sequence[Path], files: Sequence[Path], overrides: Sequence[str], start: float | None,
+    end: float | None, every: Every | None,
+) -> dict[str, str]:  # fmt: skip
+    """The facts of a run that its outputs contain. logs: as the user gave them; files: of these."""
+    from recordings.containers.digest import log_digest
+    from recordings.scoring.result_log import names_of
+
+    about = {
+        "roverflow": product_version(),
+        "pipeline": graph.text,
+        "overrides": "\n".join(overrides),
+        "log": names_of(logs),
+        "log_digest": log_digest(files) if files else "",
+        "start": "" if start is None else repr(float(start)),
+        "end": "" if end is None else repr(float(end)),
+        "every": "" if every is None else str(every),
+        **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
+    }
+    # A file name may hold bytes that are not UTF-8.
+    return {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
+
+
+@contextmanager
+def _progress_bar(total: int | None, hidden: bool) -> Iterator[tuple[Callable[[bool], None], Callable[[str], None]]]:
+    """A progress bar: what advances it by a frame, complete or not, and what prints a sentence above it."""
+    from tqdm import tqdm
+
+    drops = 0
+
+    def advance(complete: bool) -> None:
+        nonlocal drops
+        drops += not complete
+        bar.set_postfix(dropped=drops, refresh=False)
+        bar.update()
+
+    with tqdm(total=total, unit="frame", disable=hidden) as bar:
+        yield advance, lambda sentence: bar.write(f"roverflow: {sentence}", file=sys.stderr)
 
 
 def _files(graph: Graph, logs: Sequence[Path]) -> Sequence[Path]:

@@ -64,21 +64,18 @@ def run(options: argparse.Namespace) -> int:
             say(f"\nthe change has no effect on {counted(part.frames, 'frame')}, so there is no recording to write")
             return COMPLETE
         title, setting = f"{options.log[0].name} at {part.at:g} s", swept_setting(changes)
-        tables = ["\n\n".join([unchanged, *notes]), *tables]
-
-        def write(errors: Mapping[str, Sequence[float]]) -> None:
-            rows = ["## Errors", _markdown(_rows(errors))] if errors else []
-            recording.write(out, title, "\n\n".join([*rows, *tables]), _sweep(setting, errors, differences))
-
-        write({})
+        text = "\n\n".join([unchanged, *notes, *tables])
+        recording.write(out, title, text, _sweep(setting, {}, differences))
         say(f"\nwrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
         errors, unscored = _errors(paths, options.log)
         if errors:
-            say("\n" + "\n".join([*("  ".join(f"{cell:>12}" for cell in row) for row in _rows(errors)), *unscored]))
             from recordings.comparison.truth import error_pages
 
+            rows = _rows(errors)
+            say("\n" + "\n".join([*("  ".join(f"{cell:>12}" for cell in row) for row in rows), *unscored]))
             recording.errors = [*error_pages(paths, options.log)]
-            write(errors)
+            text = "\n\n".join(["## Errors", _markdown(rows), text])
+            recording.write(out, title, text, _sweep(setting, errors, differences))
             say(f"\nadded the errors to {out}")
     return COMPLETE
 

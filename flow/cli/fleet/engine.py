@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -53,9 +53,10 @@ class Fleet:
             while self.left:
                 try:
                     for future in ended.next_batch(block=False):
-                        if again := self._end(client, futures.pop(future), future):
-                            futures[again[0]] = again[1]
-                            ended.add(again[0])
+                        name = futures.pop(future)
+                        if name in self.left and (again := self._end(client, name, future)):
+                            futures[again] = name
+                            ended.add(again)
                     if time.monotonic() > looked + POLL_SECONDS:
                         self._watch(client, futures)
                         looked = time.monotonic()
@@ -97,30 +98,20 @@ class Fleet:
             if why:
                 raise UsageError(f"the worker {worker} {why}")
 
-    def _end(self, client: Any, name: str, future: Any) -> tuple[Any, str] | None:
-        """Write the row of a task that has ended; returns its future and name if it is tried once more."""
-        if name not in self.left:
-            return None
-        task = self.tasks[name]
+    def _end(self, client: Any, name: str, future: Any) -> Any:
+        """Write the row of a task that has ended; or return its next future, if its workers died for the first time."""
         if future.status == "finished":
-            row = dict(future.result())
-            if any(row[name] != value for name, value in task.identity().items()):  # a worker that came later
-                row = {"state": "failed", "why": f"{row['node']} has another version of roverflow or of the pipeline"}
+            row = _ended(self.tasks[name], future.result())
         elif future.status != "error":  # the scheduler forgot it
             raise ClusterLostError("the scheduler lost its tasks; the same command continues where this one ended")
+        elif type(error := future.exception()).__name__ != "KilledWorker":
+            row = {"state": "failed", "why": f"{type(error).__name__}: {error}"}
+        elif name in self._again:
+            row = {"state": "killed", "why": "its workers died, by memory or a fault of the machine"}
         else:
-            error = future.exception()
-            dead = type(error).__name__ == "KilledWorker"
-            if dead and name not in self._again:
-                self._again.add(name)
-                self.progress.say(f"{name}: its workers died; it is tried once more after the others")
-                return self._submit(client, name, len(self.tasks)), name
-            why = (
-                "its workers died, by memory or a fault of the machine" if dead else f"{type(error).__name__}: {error}"
-            )
-            row = {"state": "killed" if dead else "failed", "why": why}
-        if row.get("result"):
-            row["result"] = task.result.relative_to(task.folder).as_posix()
+            self._again.add(name)
+            self.progress.say(f"{name}: its workers died; it is tried once more after the others")
+            return self._submit(client, name, len(self.tasks))
         self._note(name, row)
         return None
 
@@ -168,6 +159,14 @@ def _waiting(task: Task) -> dict[str, Any]:
     """The row of a log that waits."""
     row = WAITING | task.identity()
     return row | {"log": str(task.job.log), "bytes": task.job.size, "pipeline": task.pipeline.label}
+
+
+def _ended(task: Task, row: Mapping[str, Any]) -> dict[str, Any]:
+    """The row of a task as a worker returned it, with the path of the result in the fleet's folder."""
+    if any(row[name] != value for name, value in task.identity().items()):  # a worker that came later
+        return {"state": "failed", "why": f"{row['node']} has another version of roverflow or of the pipeline"}
+    result = {"result": task.result.relative_to(task.folder).as_posix()} if row.get("result") else {}
+    return {**row, **result}
 
 
 @contextmanager
