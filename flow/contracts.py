@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
 from enum import StrEnum
 from functools import reduce
 from operator import or_
 from types import UnionType
 from typing import Any, ClassVar, Protocol, Union, get_args, get_origin
+
+MIN_ALIKE = 2 / 3  # of the letters of two names that are near; 'rnu' and 'run' share as many
 
 
 class LossReason(StrEnum):
@@ -209,6 +212,12 @@ def unaliased(kind: Any) -> Any:
     if origin in (dict, list, tuple):
         return origin[tuple(map(unaliased, arguments))]
     return kind
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """The end of a sentence about an invalid `name`: the valid name nearest to it, if one is near."""
+    close = get_close_matches(name, list(valid), n=1, cutoff=MIN_ALIKE)
+    return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def counted(number: int, what: str, many: str = "") -> str:

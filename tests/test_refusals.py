@@ -377,6 +377,8 @@ def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
 
 @pytest.mark.parametrize(("command", "usage", "words"), [
     ("rnu a.mcap", "roverflow", "there is no command 'rnu'; did you mean 'run'?"),
+    ("frobnicate", "roverflow", "there is no command 'frobnicate'; roverflow --help lists them"),
+    ("import x y", "roverflow", "there is no kind of import 'x'; roverflow import --help lists them"),
     ("import kiti a", "roverflow", "there is no kind of import 'kiti'; did you mean 'kitti'?"),
     ("export a.mcap b --mpa x", "roverflow export", "unknown: --mpa x; did you mean '--map'?"),
     ("run a b --recording x", "roverflow run", f"unknown: --recording x; roverflow run {OPTIONS}"),

@@ -20,6 +20,7 @@ from flow.cli.debugging import attempt, desk, diff, report, why
 from flow.cli.importers import images, middlebury
 from flow.cli.importers.data_sets import DATA_SETS, DataSet
 from flow.cli.replay import product_version
+from flow.contracts import nearest
 from flow.errors import FAILED, INTERRUPTED, UNUSABLE, RoverflowError
 from recordings.errors import LogError, UnwritableError
 
@@ -69,9 +70,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parsed(given: Sequence[str]) -> argparse.Namespace:
     """The options of a command line. An unknown name ends the program with the nearest valid one."""
     top = parser()
-    for what, name, known in _named(given):
+    for place, (what, name, known) in enumerate(_named(given)):
         if not name.startswith("-") and name not in known:
-            _refuse(top, f"there is no {what} '{name}'", name, known)
+            remedy = f"; {' '.join([top.prog, *given[:place]])} --help lists them"
+            _refuse(top, f"there is no {what} '{name}'", name, known, remedy)
     options, unknown = top.parse_known_args(_joined(given) or ["--help"])
     if unknown:
         valid = [option for action in options.parser._actions for option in action.option_strings]
@@ -81,10 +83,8 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace:
     return options
 
 
-def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequence[str], remedy: str = "") -> NoReturn:
+def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequence[str], remedy: str) -> NoReturn:
     """End the program with the usage of a command and the valid name nearest to `name`, or else the remedy."""
-    from flow.config.yaml_tree import nearest
-
     near = [each for each in valid if nearest(name.lstrip("-"), [each.lstrip("-")])]  # all options share the dashes
     parser.error(f"{why}{nearest(name, near) or remedy}")
 

@@ -15,7 +15,8 @@ from typing import Any
 from flow.config.node_spec import NodeSpec, mapping, place_at_fault, type_name
 from flow.config.overrides import Change, with_settings
 from flow.config.templates import SHIPPED, Expansion, Library, Scope, resolved
-from flow.config.yaml_tree import Value, nearest, nearest_or_all, read
+from flow.config.yaml_tree import Value, nearest_or_all, read
+from flow.contracts import nearest
 from flow.errors import UsageError
 from flow.runtime.graph import (
     Graph,

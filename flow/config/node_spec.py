@@ -8,7 +8,8 @@ from dataclasses import Field, dataclass, is_dataclass
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from flow.config.yaml_tree import Value, nearest, nearest_or_all
+from flow.config.yaml_tree import Value, nearest_or_all
+from flow.contracts import nearest
 from flow.parameters import coerced, is_required, parameters_of
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from flow.config.node_spec import mapping
-from flow.config.yaml_tree import Value, nearest, nearest_or_all, read
+from flow.config.yaml_tree import Value, nearest_or_all, read
+from flow.contracts import nearest
 from flow.errors import UsageError
 from flow.runtime.graph import YamlLocation
 

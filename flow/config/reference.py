@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import Any
 
 from flow.config.node_spec import ROLES, class_at, dataclass_of, lacking, type_name
-from flow.config.yaml_tree import nearest
+from flow.contracts import nearest
 from flow.errors import UsageError
 from flow.parameters import is_required, parameters_of
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner, ports_of

@@ -12,7 +12,8 @@ from pathlib import Path
 
 from flow.config.node_spec import NodeSpec, mapping
 from flow.config.overrides import Change, filled_in
-from flow.config.yaml_tree import Value, nearest, nearest_or_all, read
+from flow.config.yaml_tree import Value, nearest_or_all, read
+from flow.contracts import nearest
 from flow.runtime.graph import TemplateUse, YamlLocation, ports_of
 
 SHIPPED = Path(__file__).parent.parent / "pipelines"

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
 import yaml
 
+from flow.contracts import nearest
 from flow.runtime.graph import YamlLocation
 
 MAX_VALUES = 100_000  # of a pipeline file
-MIN_ALIKE = 2 / 3  # of the letters of two names that are near; 'rnu' and 'run' share as many
 
 
 @dataclass(frozen=True)
@@ -47,12 +46,6 @@ class Value:
         if isinstance(self.value, list):
             return [item.plain() for item in self.value]
         return self.value
-
-
-def nearest(name: str, valid: Iterable[str]) -> str:
-    """The end of a sentence about an invalid `name`: the valid name nearest to it, if one is near."""
-    close = get_close_matches(name, list(valid), n=1, cutoff=MIN_ALIKE)
-    return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def nearest_or_all(name: str, valid: Sequence[str]) -> str:

@@ -10,7 +10,6 @@ import re
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from itertools import chain, count, groupby
 from pathlib import Path
 from types import MappingProxyType
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from flow.contracts import nearest
 from recordings.atomic_write import written
 from recordings.errors import LogError, sentence_of
 from recordings.export.georeference import Georeference
@@ -119,9 +119,8 @@ def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:
     }
     for name in maps:
         if name not in streams:
-            near = get_close_matches(name, streams, n=1)
-            meant = f"; did you mean '{near[0]}'?" if near else ""
-            raise LogError(f"{result} contains no map '{name}', only {', '.join(streams) or 'none at all'}{meant}")
+            only = ", ".join(streams) or "none at all"
+            raise LogError(f"{result} contains no map '{name}', only {only}{nearest(name, streams)}")
     found = {kind: [name for name in maps if streams[name] == schema] for kind, schema in _SCHEMAS.items()}
     for kind, names in found.items():
         if len(names) > 1:
