@@ -52,6 +52,6 @@ def search_range(camera: StereoCamera, up: Array, height: float) -> dict[str, An
         "height_m": height,
         "ground_px": ground,
         "rock_px": rock,
-        "range_px": min(16.0 * max(1, math.ceil((rock + 1) / 16)), MAX_DISPARITIES),
+        "range_px": 16.0 * max(1, math.ceil(min(rock + 1, most) / 16)),
         "doubt": doubt,
     }

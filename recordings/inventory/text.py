@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from typing import Any
 
 from flow.contracts import counted
+from recordings.containers.time_range import MAX_LATENESS_NS
 from recordings.inventory.search_range import ROCK
 from recordings.source.cameras import CAMERAS
 
+PAIRED_SHARE = 0.9  # of the images of the camera with fewer of them, that have a partner; fewer are unusual
 MAX_TILT_DELAY = 0.9  # s; a run waits one second for a tilt by default (tilt.patience)
 
 
@@ -30,10 +34,7 @@ def format_description(description: dict[str, Any]) -> str:
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     if all(side in d["streams"] for side in CAMERAS):
         lines.append(_frame_line(d["frames"]))
-        late = (d["frames"]["tilt_delay_s"] or 0) - (d["frames"]["delay_s"] or [0, 0])[1]
-        if late > MAX_TILT_DELAY:
-            remedy = f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them"
-            lines.append(f"doubtful: from stamp to log, tilts take {late:.1f} s longer than images; {remedy}")
+        lines += [f"doubtful: {doubt}" for doubt in _stamp_doubts(d["frames"])]
     if d["mount"]:
         base, position = d["mount"]["base"], [round(value, 4) for value in d["mount"]["position"] or ()]
         lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
@@ -55,6 +56,20 @@ def format_description(description: dict[str, Any]) -> str:
     lines += [d["undecodable"]] if d["undecodable"] and d["undecodable"] not in d.get("refused", "") else []
     lines += [f"damaged: {damage}" for damage in d["damage"]]
     return "\n".join(lines)
+
+
+def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
+    """What is unusual about the stamps, a sentence each, with the setting for it."""
+    offset, fewer = frames["pair_offset_s"], min(frames["left"], frames["right"])
+    if offset is not None and frames["pairs"] < PAIRED_SHARE * fewer:
+        remedy = f"if they are taken at one time, --set stereo.slop={math.ceil(offset * 1e3)}ms pairs most of them"
+        yield f"the stamps of left and right images differ by up to {offset * 1e3:.3g} ms; {remedy}"
+    late = (frames["tilt_delay_s"] or 0) - (frames["delay_s"] or [0, 0])[1]
+    if abs(late) > MAX_LATENESS_NS / 1e9 and frames["with_tilt"] == 0:
+        yield f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s; record both with one"
+    elif late > MAX_TILT_DELAY:
+        remedy = f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them"
+        yield f"from stamp to log, tilts take {late:.1f} s longer than images; {remedy}"
 
 
 def _table(topics: list[dict[str, Any]], roles: dict[str, str]) -> list[str]:

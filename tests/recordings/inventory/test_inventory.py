@@ -152,6 +152,26 @@ def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
         assert (doubt in text) == doubted
 
 
+@pytest.mark.parametrize("seconds", [100, -37])
+def test_tilts_of_another_clock_are_doubted(tmp_path, seconds):
+    edit = changed(TILT, {"header.stamp.sec": lambda stamp: stamp + seconds})
+    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
+    doubt = f"the stamps of tilts and images are of clocks that differ by {abs(seconds):.1f} s; record both with one"
+    assert f"doubtful: {doubt}" in text
+    assert "tilt.patience" not in text
+
+
+@pytest.mark.parametrize(("offset", "doubt"), [
+    (4, ""), (8, "differ by up to 8 ms; if they are taken at one time, --set stereo.slop=8ms pairs most of them"), (PERIOD // 2_000_000, ""),
+])  # fmt: skip
+def test_images_that_a_wider_tolerance_would_pair_are_doubted(tmp_path, offset, doubt):
+    edit = changed(RIGHT, {"header.stamp.nanosec": lambda time: time + offset * 1_000_000})
+    path = write_sample(tmp_path / "log.mcap", edit)
+    text = format_description(inventory_of(path))
+    assert ("doubtful" in text, doubt in text) == (bool(doubt), True)
+    assert not doubt or inventory_of(path, slop=8_000_000)["frames"]["pairs"] == FRAMES
+
+
 def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
     path = write_sample(tmp_path / "log.mcap", changed("camera_info", {"width": 60, "height": 32}))
     doubt = "cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
