@@ -1,7 +1,6 @@
 """An interrupted import is continued by the same command, and gives the bytes of one that was not interrupted."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.mcap.resumable import ResumableWriter
 from recordings.ros2.to_msg import image
 from tests.conftest import roverflow, slow
+from tests.limits import file_size_limited
 from tests.recordings.sample_log import model
 
 PAIRS = 6
@@ -108,12 +108,8 @@ def test_the_import_of_a_process_that_was_ended_is_continued(source, tmp_path, n
 
 def test_the_import_that_a_full_disk_ended_is_continued(source, tmp_path, capsys, said):
     out, whole = tmp_path / "out.mcap", (source / "whole.mcap").read_bytes()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (len(whole) // 2, limits[1]))
+    with file_size_limited(len(whole) // 2):
         assert roverflow(*importing(source, out)) == 1
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     (left,) = tmp_path.iterdir()
     assert f"what was written is in {left}, and the same command continues it" in capsys.readouterr().err
     assert "continues the interrupted import after" in said(0, *importing(source, out)).out

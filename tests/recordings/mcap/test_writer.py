@@ -1,7 +1,6 @@
 """A written log is complete under its name or absent, whatever happens."""
 
 import os
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import image
+from tests.limits import file_size_limited
 
 
 def test_a_log_gets_its_name_when_it_is_complete(tmp_path):
@@ -69,18 +69,11 @@ def test_a_stamp_outside_ros_time_is_refused(tmp_path, stamp):
 
 
 def test_a_full_disk_is_reported_and_leaves_no_file(tmp_path):
-    resource = pytest.importorskip("resource")
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     writer = Ros2Writer(tmp_path / "out.mcap")
     noise = np.random.default_rng(0).integers(0, 256, (512, 512), dtype=np.uint8)
-    try:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, before[1]))
+    with file_size_limited(300_000):
         writer.write("/image", image(1, "cam", noise), 1)
         with pytest.raises(LogError, match=r"cannot write .*out\.mcap: File too large"):
             writer.write("/image", image(2, "cam", noise), 2)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, ignored)
     writer.close()
     assert list(tmp_path.iterdir()) == []

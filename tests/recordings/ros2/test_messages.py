@@ -20,26 +20,9 @@ from recordings.containers.header import begins_with_header
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
+from recordings.ros2 import to_msg
 from recordings.ros2.cdr import decoder_for, standard_types
-from recordings.ros2.from_msg import (
-    read_disparity,
-    read_grid_map,
-    read_occupancy_grid,
-    read_point_cloud,
-    stamp_of,
-)
-from recordings.ros2.to_msg import (
-    camera_info,
-    diagnostics,
-    disparity_image,
-    grid_map,
-    image,
-    imu,
-    occupancy_grid,
-    odometry,
-    point_cloud,
-    transform_message,
-)  # fmt: skip
+from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid, read_point_cloud, stamp_of
 from stages.data import (
     Disparity,
     ElevationMap,
@@ -82,16 +65,16 @@ def navigation() -> NavigationMap:
 def one_of_each() -> dict[str, Any]:
     transform = Transform("level", "camera", np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), [1, 2, 3])
     return {
-        "/image": image(STAMP, "cam", np.arange(24, dtype=np.uint8).reshape(2, 4, 3)),
-        "/info": camera_info(STAMP, "cam", model("right")),
-        "/disparity": disparity_image(disparity()),
-        "/points": point_cloud(cloud()),
-        "/grid": grid_map(terrain()),
-        "/map": occupancy_grid(navigation()),
-        "/tf": transform_message([(transform, STAMP)]),
-        "/imu": imu(STAMP, "imu", np.array([0.1, 0.2, 0.3, 0.927]), np.eye(3) * 0.5),
-        "/odom": odometry(Pose(STAMP, [1, 2, 3], [0, 0, 0.6, 0.8], "odom", "base", np.eye(6))),
-        "/diagnostics": diagnostics(STAMP, [(2, "match", "no texture", {"reason": "failed"})]),
+        "/image": to_msg.image(STAMP, "cam", np.arange(24, dtype=np.uint8).reshape(2, 4, 3)),
+        "/info": to_msg.camera_info(STAMP, "cam", model("right")),
+        "/disparity": to_msg.disparity_image(disparity()),
+        "/points": to_msg.point_cloud(cloud()),
+        "/grid": to_msg.grid_map(terrain()),
+        "/map": to_msg.occupancy_grid(navigation()),
+        "/tf": to_msg.transform_message([(transform, STAMP)]),
+        "/imu": to_msg.imu(STAMP, "imu", np.array([0.1, 0.2, 0.3, 0.927]), np.eye(3) * 0.5),
+        "/odom": to_msg.odometry(Pose(STAMP, [1, 2, 3], [0, 0, 0.6, 0.8], "odom", "base", np.eye(6))),
+        "/diagnostics": to_msg.diagnostics(STAMP, [(2, "match", "no texture", {"reason": "failed"})]),
     }
 
 
@@ -141,7 +124,7 @@ def test_another_decoder_reads_the_same_numbers(written):
 
 def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y():
     ours = terrain()
-    message = grid_map(ours)
+    message = to_msg.grid_map(ours)
     assert (message.info.length_x, message.info.length_y) == (1.5, 1.0)
     assert (message.info.pose.position.x, message.info.pose.position.y) == (-0.25, 4.5)
     layer = message.data[message.layers.index("count")]
@@ -159,7 +142,7 @@ def test_a_grid_map_starts_at_the_corner_of_largest_x_and_y():
 def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x):
     layer = np.random.default_rng(rows * 10 + cols).normal(size=(rows, cols)).astype(np.float32)
     ours = ElevationMap(STAMP, {"elevation": layer}, cell, (x, -x / 3), "odom")
-    back = read_grid_map(grid_map(ours))
+    back = read_grid_map(to_msg.grid_map(ours))
     np.testing.assert_array_equal(back.layers["elevation"], layer)
     np.testing.assert_allclose(back.origin, ours.origin, atol=1e-9)
     assert (back.resolution, back.frame_id, back.stamp) == (cell, "odom", STAMP)
@@ -167,19 +150,19 @@ def test_a_grid_map_is_read_back_unchanged(rows, cols, cell, x):
 
 def test_unknown_cells_of_a_grid_map_have_one_form():
     layer = np.float32([[np.nan, -np.nan, 1], [0, -np.inf, -np.nan]])
-    message = grid_map(ElevationMap(STAMP, {"elevation": layer}, 0.5, (0.0, 0.0), "odom"))
+    message = to_msg.grid_map(ElevationMap(STAMP, {"elevation": layer}, 0.5, (0.0, 0.0), "odom"))
     found = message.data[0].data
     np.testing.assert_array_equal(found, layer.ravel()[::-1])
     assert {*found.view(np.uint32)[np.isnan(found)].tolist()} == {0x7FC00000}
 
 
 def test_a_grid_map_without_cells_is_read_back():
-    message = grid_map(ElevationMap(STAMP, {"elevation": np.empty((0, 3), np.float32)}, 0.5, (0.0, 0.0), "odom"))
+    message = to_msg.grid_map(ElevationMap(STAMP, {"elevation": np.empty((0, 3), np.float32)}, 0.5, (0.0, 0.0), "odom"))
     assert read_grid_map(message).shape == (0, 3)
 
 
 def test_an_occupancy_grid_starts_at_the_lower_left():
-    message = occupancy_grid(navigation())
+    message = to_msg.occupancy_grid(navigation())
     assert (message.info.width, message.info.height) == (3, 2)
     assert (message.info.origin.position.x, message.info.origin.position.y) == (-1.0, 4.0)
     assert message.data.tolist() == [0, 100, -1, 0, 0, 100]
@@ -189,16 +172,16 @@ def test_an_occupancy_grid_starts_at_the_lower_left():
 
 
 def test_disparity_obeys_depth_equals_f_times_t_over_d():
-    message = disparity_image(disparity(cx_right=12.0))
+    message = to_msg.disparity_image(disparity(cx_right=12.0))
     d = read_disparity(message)
     np.testing.assert_array_equal(d, disparity().pixels + 2)
     assert np.isnan(d[0, 1])
     assert (message.f, message.t, message.min_disparity, message.max_disparity) == (100.0, 0.25, 3.5, 8.0)
-    np.testing.assert_array_equal(read_disparity(disparity_image(disparity())), disparity().pixels)
+    np.testing.assert_array_equal(read_disparity(to_msg.disparity_image(disparity())), disparity().pixels)
 
 
 def test_a_cloud_packs_colours_as_in_pcl():
-    message = point_cloud(cloud())
+    message = to_msg.point_cloud(cloud())
     assert [(f.name, f.offset, f.datatype) for f in message.fields] == [
         ("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("rgb", 12, 7), ("sigma", 16, 7),
     ]  # fmt: skip
@@ -210,7 +193,7 @@ def test_a_cloud_packs_colours_as_in_pcl():
 
 def test_a_transform_message_turns_points_like_its_transform():
     transform = Transform("level", "camera", np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0.0]]), [1, 2, 3])
-    sent = transform_message([(transform, STAMP)]).transforms[0]
+    sent = to_msg.transform_message([(transform, STAMP)]).transforms[0]
     assert (sent.header.frame_id, sent.child_frame_id, stamp_of(sent.header)) == ("level", "camera", STAMP)
     q, v = sent.transform.rotation, np.array([1.0, -2.0, 0.5])
     u = np.array([q.x, q.y, q.z])
@@ -321,7 +304,7 @@ def test_a_point_cloud_is_read_back_unchanged():
     points, colors = rng.normal(size=(7, 3)).astype(np.float32), rng.integers(0, 256, (7, 3), dtype=np.uint8)
     points[2] = np.nan
     sigma = rng.uniform(0.01, 0.2, 7).astype(np.float32)
-    message = point_cloud(PointCloud(5, points, colors, sigma, np.arange(7, dtype=np.int32), "level"))
+    message = to_msg.point_cloud(PointCloud(5, points, colors, sigma, np.arange(7, dtype=np.int32), "level"))
     read = read_point_cloud(message)
     np.testing.assert_array_equal(np.column_stack([read[name] for name in "xyz"]), points)
     np.testing.assert_array_equal(read["colors"], colors)
@@ -335,8 +318,8 @@ def test_a_point_cloud_contains_the_origin_of_its_points():
     source = np.array([PixelOrigin.MEASURED, PixelOrigin.FILLED, PixelOrigin.PLANE], np.uint8)
     black, index = np.zeros((3, 3), np.uint8), np.arange(3, dtype=np.int32)
     cloud = PointCloud(1, points, black, np.ones(3, np.float32), index, "level", source=source)
-    assert read_point_cloud(point_cloud(cloud))["source"].tolist() == source.tolist()
-    assert "source" not in read_point_cloud(point_cloud(replace(cloud, source=None)))
+    assert read_point_cloud(to_msg.point_cloud(cloud))["source"].tolist() == source.tolist()
+    assert "source" not in read_point_cloud(to_msg.point_cloud(replace(cloud, source=None)))
 
 
 def test_the_error_of_an_unparsable_schema_is_short():

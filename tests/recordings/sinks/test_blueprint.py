@@ -21,11 +21,8 @@ def container(specs: list[ViewSpec], desk: str = "overview") -> Any:
 
 
 def test_the_blueprint_has_a_view_for_each_entity_and_no_empty_one():
-    specs = [
-        ViewSpec(Panel.LEFT, "rectified", "left", "left"),
-        ViewSpec(Panel.DISPARITY, "matched", "pixels", "matched"),
-    ]
-    names = [view.name for view in views(container(specs))]
+    shown = (Panel.LEFT, "rectified", "left", "left"), (Panel.DISPARITY, "matched", "pixels", "matched")
+    names = [view.name for view in views(container([ViewSpec(*spec) for spec in shown]))]
     assert sorted(names) == ["frames", "ledger", "left", "matched", "run"]
 
 

@@ -1,7 +1,5 @@
 """Results in Foxglove's messages, read back with Foxglove's own reader and held against the ROS 2 ones."""
 
-from itertools import groupby
-
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -35,10 +33,7 @@ def messages(foxglove):
 @pytest.fixture(scope="module")
 def ros2(result):
     """The same of the run in the profile ros2."""
-    return {
-        topic: next(group)[2]
-        for topic, group in groupby(sorted(iter_decoded(result), key=lambda m: m[0]), lambda m: m[0])
-    }
+    return {topic: message for topic, _, message in reversed(list(iter_decoded(result)))}
 
 
 def column(message, name, stride):

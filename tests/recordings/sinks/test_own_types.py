@@ -20,6 +20,7 @@ from recordings.sinks.own_types import leaves, refusal
 from stages.data import Disparity, StereoFrame, Transform
 from tests.conftest import FRAMES, roverflow
 from tests.recordings.sinks.recorded_scene import START, Record, decoded, entities, record_of, rows, scene
+from tests.recordings.sinks.test_mcap_sink import last_messages, logged
 
 PIPELINE = """\
 source: {use: recordings.McapSource}
@@ -78,16 +79,9 @@ def report() -> Report:
 
 def written(path: Path, kinds: dict[str, Any], *frames: dict[str, Any]) -> dict[str, Any]:
     """The last message of each topic of a log with these streams."""
-    sink = McapSink(results=tuple(kinds))
-    assert not any(sink.unwritable(name, kind) for name, kind in kinds.items())
-    sink.open(path, kinds, {})
-    try:
-        for number, items in enumerate(frames):
-            sink.write(Record(START + number, items))  # type: ignore[arg-type]
-        sink.close({})
-    finally:
-        sink.discard()
-    return {topic: message for topic, _, message in iter_decoded(path)}
+    assert not any(McapSink(results=tuple(kinds)).unwritable(name, kind) for name, kind in kinds.items())
+    records = (Record(START + number, items) for number, items in enumerate(frames))
+    return last_messages(logged(path, *records, streams=kinds, results=tuple(kinds)))
 
 
 def drawn(path: Path, kinds: dict[str, Any], *frames: dict[str, Any]) -> set[str]:
@@ -183,9 +177,8 @@ def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
 
 def test_own_types_are_drawn_field_by_field(tmp_path):
     path = tmp_path / "own.rrd"
-    found = drawn(
-        path, {"own/report": Report, "level": int, "note": str}, {"own/report": report(), "level": 3, "note": "dry"}
-    )
+    kinds = {"own/report": Report, "level": int, "note": str}
+    found = drawn(path, kinds, {"own/report": report(), "level": 3, "note": "dry"})
     own = {entity.removeprefix("/own/report/") for entity in found if entity.startswith("/own/report/")}
     assert own >= {"blur", "mask", "corners", "histogram", "text", "by_side/2", "disparity/pixels", "range_m"}
     assert rows(path, "/level", "Scalars:scalars")[0][2] == [3.0]

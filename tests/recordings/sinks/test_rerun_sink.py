@@ -1,7 +1,6 @@
 """The rerun recording contains every intermediate at its own time, and clears those that a frame lacks."""
 
 import math
-import resource
 import subprocess
 import sys
 import threading
@@ -17,6 +16,7 @@ from recordings.sinks.canvas import MAX_POINTS
 from recordings.sinks.rerun_recording import PLOT_BATCH, RESERVED_BYTES
 from recordings.sinks.rerun_sink import RerunSink
 from stages.data import Disparity, Mount
+from tests.limits import file_size_limited
 from tests.recordings.sinks.recorded_scene import (
     START,
     STEP,
@@ -39,7 +39,7 @@ def opened(path):
     return sink
 
 
-def test_every_intermediate_is_recorded(rrd):
+def test_every_intermediate_is_recorded_and_the_recording_passes_reruns_own_check(rrd):
     assert entities(rrd) >= {
         "/rectified/left", "/rectified/right", "/matched/pixels", "/matched/source/labels", "/disparity/pixels",
         "/disparity/source/labels", "/disparity/superpixels", "/points/points", "/elevation_map/relief",
@@ -47,6 +47,8 @@ def test_every_intermediate_is_recorded(rrd):
         "/navigation_map/reason/labels", "/navigation_map/hazards", "/rectified/camera", "/pose/trajectory",
         "/seconds/matched", "/queues/disparity", "/tilt/inclinometer\\ x\\ up", "/ledger", "/summary",
     }  # fmt: skip
+    verify = [sys.executable, "-m", "rerun", "rrd", "verify", rrd]
+    assert subprocess.run(verify, capture_output=True).returncode == 0
 
 
 def test_entities_have_the_stamp_of_their_frame_in_nanoseconds(rrd):
@@ -175,11 +177,6 @@ def test_frames_may_come_from_different_threads(tmp_path):
     assert times == [(START + n * STEP, n) for n in range(4)]
 
 
-def test_a_recording_passes_reruns_own_check(rrd):
-    check = subprocess.run([sys.executable, "-m", "rerun", "rrd", "verify", str(rrd)], capture_output=True, text=True)
-    assert check.returncode == 0, check.stderr
-
-
 def test_a_recording_has_its_name_only_when_it_is_complete(tmp_path):
     path = tmp_path / "run.rrd"
     sink = opened(path)
@@ -219,31 +216,23 @@ def test_an_unwritable_path_is_named(tmp_path):
 def test_a_full_disk_is_an_error_and_leaves_no_file(tmp_path, monkeypatch):
     """rerun reports an unexpected full disk only in its log, so the sink checks for it."""
     monkeypatch.setattr("recordings.sinks.rerun_recording.room_to_grow", lambda file: RESERVED_BYTES)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = opened(tmp_path / "run.rrd")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
+    with file_size_limited(10_000):
         for n in range(3):
             sink.write(Record(START + n, scene(START + n)))
         with pytest.raises(LogError, match="cannot write"):
             sink.close({"verdict": "COMPLETE"})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_recording_ends_before_the_disk_is_full(tmp_path):
     """rerun's writer never returns if the disk is full or the file cannot grow."""
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     sink = opened(tmp_path / "run.rrd")
-    resource.setrlimit(resource.RLIMIT_FSIZE, (RESERVED_BYTES // 2, limits[1]))
-    try:
+    with file_size_limited(RESERVED_BYTES // 2):
         with pytest.raises(LogError, match=r"cannot write .* 64 MB more can be written"):
             sink.write(Record(START, scene(START)))
         sink.close({"verdict": "INCOMPLETE"})
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert [file.name for file in tmp_path.iterdir()] == ["run.rrd"]
 
 
