@@ -93,14 +93,10 @@ def test_partners_logged_more_than_a_second_late_are_paired():
 def test_a_pair_too_far_apart_reports_the_distance_and_the_setting():
     frames = [(side, at * MS + (side == "right") * 8_020_000, 1.0) for at in (0, 500) for side in ("left", "right")]
     lost = pairing(*frames)
-    assert [(entry.stream, entry.reason) for entry in lost] == [
-        (side, LossReason.UNMATCHED) for side in ("left", "right", "left", "right")
-    ]
-    assert [entry.detail for entry in lost[:3]] == [
-        "the nearest right without a partner is 8.02 ms away, more than 5 ms (stereo.slop)",
-        "the nearest left without a partner is 8.02 ms away, more than 5 ms (stereo.slop)",
-        "the nearest right without a partner is 8.02 ms away, more than 5 ms (stereo.slop)",
-    ]
+    lost_sides = [(entry.stream, entry.reason) for entry in lost]
+    assert lost_sides == [(side, LossReason.UNMATCHED) for side in ("left", "right", "left", "right")]
+    away = "the nearest {} without a partner is 8.02 ms away, more than 5 ms (stereo.slop)"
+    assert [entry.detail for entry in lost[:3]] == [away.format(side) for side in ("right", "left", "right")]
     assert len(pairing(*frames, slop=10 * MS)) == 2
 
 
@@ -118,8 +114,7 @@ def test_a_partner_logged_too_late_reports_the_delay_and_the_setting():
 
 def test_items_that_cannot_be_paired_lose_their_frame_with_the_reason():
     (answer,) = pairing(("left", 10, -1.0), ("right", 10, 2.0))
-    assert answer.stamp == 10
-    assert answer.value.cause.reason is LossReason.FAILED
+    assert (answer.stamp, answer.value.cause.reason) == (10, LossReason.FAILED)
     assert "negative" in answer.value.cause.detail
 
 
@@ -137,11 +132,27 @@ def test_every_message_is_in_a_pair_or_in_the_ledger_but_never_in_both(lefts, ri
     assert [p.stamp for p in pairs] == sorted(p.stamp for p in pairs)
 
 
-def test_interpolation_is_exact_at_and_between_samples():
-    answers = sampling(
-        Interpolate(), ("stream", 0, 0.0), ("at", 0, 0.0), ("at", 25, 0.0), ("stream", 100, 10.0), ("at", 100, 0.0)
-    )
-    assert values(answers) == [(0, 0.0), (25, 2.5), (100, 10.0)]
+ONE, TWO = ("stream", 0, 1.0), ("stream", 100, 2.0)
+UNALIGNED = [LossReason.UNALIGNED]
+
+
+@pytest.mark.parametrize(("config", "messages", "found", "lost"), [
+    (Interpolate(), [ONE, ("at", 0, 0.0), ("at", 25, 0.0), TWO, ("at", 100, 0.0)],
+     [(0, 1.0), (25, 1.25), (100, 2.0)], []),
+    (Interpolate(), [("at", 0, 0.0), ("stream", 10, 1.0), ("stream", 20, 1.0)], [], UNALIGNED),
+    (Interpolate(), [("stream", 10, 1.0), ("at", 30, 0.0)], [], UNALIGNED),
+    (Interpolate(), [ONE, ("at", 50, 0.0), (*TWO, 900 * MS)], [(50, 1.5)], []),
+    (Interpolate(patience=10 * MS), [ONE, ("at", 50, 0.0), (*TWO, 900 * MS)], [], UNALIGNED),
+    (Nearest(slop=50), [ONE, ("at", 60, 0.0), TWO, ("at", 400, 0.0)], [(60, 2.0)], UNALIGNED),
+    (Latest(), [ONE, ("at", 60, 0.0), TWO, ("at", 90, 0.0, 110), ("at", 400, 0.0)],
+     [(60, 1.0), (90, 1.0), (400, 2.0)], []),
+], ids=[
+    "exact at and between samples", "no sample before", "no sample after", "a sample logged late",
+    "a sample logged too late", "the nearer neighbour within the slop", "the last sample logged by then",
+])  # fmt: skip
+def test_a_sampler_takes_the_samples_that_it_should(config, messages, found, lost):
+    answers = sampling(config, *messages)
+    assert (values(answers), reasons(answers)) == (found, lost)
 
 
 def test_a_gap_longer_than_the_patience_is_a_gap_for_every_frame_in_it():
@@ -205,12 +216,10 @@ def test_samples_logged_too_late_report_the_wait_and_its_setting(config):
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: type(config).__name__)
-def test_clocks_that_are_far_apart_report_the_distance(config):
-    hour = 3_600_000 * MS
-    (early,) = sampling(config, ("stream", hour, 0.0, 0), ("at", 0, 0.0, 0))
-    assert "3600 s " in early.value.cause.detail
-    (late,) = sampling(config, ("stream", 0, 0.0, 0), ("at", hour, 0.0, 0))
-    assert "3600 s " in late.value.cause.detail
+@pytest.mark.parametrize(("sample", "frame"), [(3_600_000 * MS, 0), (0, 3_600_000 * MS)])
+def test_clocks_that_are_far_apart_report_the_distance(config, sample, frame):
+    (answer,) = sampling(config, ("stream", sample, 0.0, 0), ("at", frame, 0.0, 0))
+    assert "3600 s " in answer.value.cause.detail
 
 
 def test_an_unaligned_sample_names_the_limit_it_exceeds():
@@ -220,30 +229,6 @@ def test_an_unaligned_sample_names_the_limit_it_exceeds():
     messages = [("stream", 0, 1.0), ("at", 60 * MS, 0.0), ("stream", 200 * MS, 2.0)]
     assert detail(Nearest(), *messages) == "the nearest level sample is 60 ms away, more than 50 ms (tilt.slop)"
     assert detail(Latest(), *messages[1:]) == "no level sample logged by then"
-
-
-def test_interpolation_never_extrapolates():
-    early = sampling(Interpolate(), ("at", 0, 0.0), ("stream", 10, 1.0), ("stream", 20, 1.0))
-    late = sampling(Interpolate(), ("stream", 10, 1.0), ("at", 30, 0.0))
-    assert reasons(early) == reasons(late) == [LossReason.UNALIGNED]
-
-
-def test_a_sample_logged_late_is_still_used_within_the_patience():
-    messages = [("stream", 0, 0.0, 0), ("at", 50, 0.0, 50), ("stream", 100, 1.0, 900 * MS)]
-    assert values(sampling(Interpolate(), *messages)) == [(50, 0.5)]
-    assert reasons(sampling(Interpolate(patience=10 * MS), *messages)) == [LossReason.UNALIGNED]
-
-
-def test_nearest_takes_the_nearer_neighbour_within_the_slop():
-    messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 400, 0.0)]
-    answers = sampling(Nearest(slop=50), *messages)
-    assert values(answers) == [(60, 2.0)]
-    assert reasons(answers) == [LossReason.UNALIGNED]
-
-
-def test_latest_takes_the_last_sample_logged_by_then():
-    messages = [("stream", 0, 1.0), ("at", 60, 0.0), ("stream", 100, 2.0), ("at", 90, 0.0, 110), ("at", 400, 0.0)]
-    assert values(sampling(Latest(), *messages)) == [(60, 1.0), (90, 1.0), (400, 2.0)]
 
 
 @given(st.lists(st.integers(0, 1000), min_size=2, unique=True).map(sorted), st.integers(0, 50))

@@ -54,12 +54,8 @@ class Text:
 @dataclass(frozen=True)
 class Source:
     streams: ClassVar[Mapping[str, type]] = {
-        "left": Number,
-        "right": Number,
-        "level": Number,
-        "words": Text,
-        "way": Place,
-    }
+        "left": Number, "right": Number, "level": Number, "words": Text, "way": Place,
+    }  # fmt: skip
     gain: float = 1.0
 
     def open(self, path: Path, *, start: float | None, end: float | None) -> AbstractContextManager[Log]:
@@ -266,3 +262,9 @@ def replayed_log(graph, log, **options):
     """(sink, summary) of a run of a log."""
     ((use, sink),) = graph.sinks
     return sink, run(graph, log, {use: Path("unused")}, **options)
+
+
+def sink_of(graph):
+    """The only sink of a graph."""
+    ((_, sink),) = graph.sinks
+    return sink

@@ -50,9 +50,9 @@ def test_times_of_whole_nanoseconds_are_exact(nanoseconds, unit):
     assert quantity(f"{number} {name}", "ns") == nanoseconds * (60 if name == "min" else 1)
 
 
-@pytest.mark.parametrize("text", ["1e-400 s", "0 s", "1e400 s"])
-def test_numbers_beyond_float_range_become_zero_or_infinite(text):
-    assert quantity(text, "ns") in (0.0, math.inf)
+@pytest.mark.parametrize(("text", "number"), [("1e-400 s", 0.0), ("0 s", 0.0), ("1e400 s", math.inf)])
+def test_numbers_beyond_float_range_become_zero_or_infinite(text, number):
+    assert quantity(text, "ns") == number
 
 
 def test_streams_may_be_written_in_any_order(tmp_path):

@@ -14,12 +14,9 @@ from tests.flow.toys import Couple, Keep, Meter, Scale, graph, replayed, travers
 class Encoding(Keep):
     """A sink that prepares texts; it meets one worker more while it prepares `meet_at`."""
 
-    meet_at = -1.0
-    bad = -1.0
-
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
-        self.meeting = threading.Barrier(2)
+    def __init__(self, meet_at=-1.0, bad=-1.0):
+        super().__init__()
+        self.meet_at, self.bad, self.meeting = meet_at, bad, threading.Barrier(2)
 
     def prepare(self, stream, item):
         if item.value == self.meet_at and stream in ("twice", "thrice"):
@@ -52,20 +49,15 @@ def test_a_sink_gets_what_it_prepared_in_order(tmp_path):
 
 
 def test_two_workers_prepare_items_of_one_frame_at_once(tmp_path):
-    sink = Encoding()
-    sink.meet_at = 0.0
-    engine, _ = run_with(sink, graph(tmp_path), 1)
+    engine, _ = run_with(sink := Encoding(meet_at=0.0), graph(tmp_path), 1)
     assert (engine.failure, len(sink.records)) == (None, 1)
 
 
 def test_a_sink_that_cannot_prepare_an_item_stops_the_run(tmp_path):
-    sink = Encoding()
-    sink.bad = 3.0
-    engine, ledger = run_with(sink, graph(tmp_path), 2)
+    engine, ledger = run_with(Encoding(bad=3.0), graph(tmp_path), 2)
     assert engine.failure[0] == "sink"
-    assert [(entry.stage, entry.detail.split(" (")[0]) for entry in ledger.entries if entry.reason == "failed"] == [
-        ("sink", "OSError: cannot encode")
-    ]
+    failed = [(entry.stage, entry.detail.split(" (")[0]) for entry in ledger.entries if entry.reason == "failed"]
+    assert failed == [("sink", "OSError: cannot encode")]
 
 
 def test_a_prepared_item_is_let_go_before_the_frame_is_written(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """Findings of the stages reach the user and the sinks, warnings last."""
 
+import pytest
+
 from flow.cli.report import headline, report
 from flow.contracts import Finding, LossReason, Severity
 from flow.runtime.findings import explained
@@ -48,30 +50,23 @@ def test_a_warning_that_assumes_what_has_a_fault_becomes_a_note():
     assert explained({"pose": blamed}, {"rectified": fault})["pose"].severity is Severity.NOTE
 
 
-def verdict_line(**changes):
+@pytest.mark.parametrize(("changes", "line"), [
+    ({"verdict": "COMPLETE"}, "COMPLETE: 18 of 18 frames complete"),
+    ({"drops": {"unmatched": 2}}, "INCOMPLETE: 18 frames complete, 2 losses: 2 unmatched"),
+    ({"frames_out": 17, "drops": {"failed": 1, "unreadable": 2}},
+     "INCOMPLETE: 17 of 18 frames complete, 3 losses: 2 unreadable, 1 failed"),
+    ({"drops": {"unmatched": 5, "unreadable": 5}},  # the cause first
+     "INCOMPLETE: 18 frames complete, 10 losses: 5 unreadable, 5 unmatched"),
+    ({"interrupted": True, "frames_in": 1, "frames_out": 1}, "INCOMPLETE: interrupted after 1 frame"),
+    ({"interrupted": True, "frames_out": 15, "drops": {"abandoned": 3}},  # which are no losses
+     "INCOMPLETE: interrupted after 15 of 18 frames, 3 abandoned"),
+    ({"interrupted": True, "frames_out": 14, "drops": {"abandoned": 3, "failed": 1}},
+     "INCOMPLETE: interrupted after 14 of 18 frames, 3 abandoned, 1 loss: 1 failed"),
+    ({"interrupted": True, "verdict": "COMPLETE"}, "COMPLETE: 18 of 18 frames complete"),
+])  # fmt: skip
+def test_the_verdict_line_counts_the_losses_by_reason_and_abandoned_frames_apart(changes, line):
     summary = {"verdict": "INCOMPLETE", "interrupted": False, "frames_in": 18, "frames_out": 18, "drops": {}}
-    return headline({**summary, "frames_per_second": 2.5, **changes}).removesuffix("; 2.50 frames/s")
-
-
-def test_the_verdict_line_counts_the_losses_by_reason():
-    assert verdict_line(verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
-    assert verdict_line(drops={"unmatched": 2}) == "INCOMPLETE: 18 frames complete, 2 losses: 2 unmatched"
-    lost = {"failed": 1, "unreadable": 2}
-    assert (
-        verdict_line(frames_out=17, drops=lost)
-        == "INCOMPLETE: 17 of 18 frames complete, 3 losses: 2 unreadable, 1 failed"
-    )
-    lost = verdict_line(drops={"unmatched": 5, "unreadable": 5})
-    assert lost.endswith(": 5 unreadable, 5 unmatched")  # the cause first
-    assert verdict_line(interrupted=True, frames_in=1, frames_out=1) == "INCOMPLETE: interrupted after 1 frame"
-
-
-def test_abandoned_frames_are_not_counted_as_losses():
-    stopped = verdict_line(interrupted=True, frames_out=15, drops={"abandoned": 3})
-    assert stopped == "INCOMPLETE: interrupted after 15 of 18 frames, 3 abandoned"
-    stopped = verdict_line(interrupted=True, frames_out=14, drops={"abandoned": 3, "failed": 1})
-    assert stopped == "INCOMPLETE: interrupted after 14 of 18 frames, 3 abandoned, 1 loss: 1 failed"
-    assert verdict_line(interrupted=True, verdict="COMPLETE") == "COMPLETE: 18 of 18 frames complete"
+    assert headline({**summary, "frames_per_second": 2.5, **changes}).removesuffix("; 2.50 frames/s") == line
 
 
 def test_findings_reach_the_summary_and_the_sinks(tmp_path):

@@ -11,7 +11,7 @@ import pytest
 from flow.errors import SinkError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
 from flow.runtime.run import asked, with_spare_threads
-from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, traverse
+from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, sink_of, traverse
 
 
 def test_a_failing_frame_is_recorded_and_the_others_go_on(tmp_path):
@@ -20,10 +20,8 @@ def test_a_failing_frame_is_recorded_and_the_others_go_on(tmp_path):
     assert list(sink.values("thrice").values()) == [3.0 * i for i in range(10)]
     assert summary["verdict"] == "INCOMPLETE"
     assert summary["drops"] == {"failed": 2}
-    assert [(entry["stage"], entry["detail"]) for entry in summary["ledger"]] == [
-        ("twice", "cannot scale 3.0"),
-        ("twice", "cannot scale 7.0"),
-    ]
+    lost = [(entry["stage"], entry["detail"]) for entry in summary["ledger"]]
+    assert lost == [("twice", "cannot scale 3.0"), ("twice", "cannot scale 7.0")]
     assert [r.index for r in sink.records if r.entries] == [3, 7]
 
 
@@ -83,28 +81,33 @@ def test_a_result_of_the_wrong_type_or_stamp_fails_the_frame_not_the_run(tmp_pat
 
 def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
     pipeline = graph(tmp_path, fail_at=5)
-    ((_, sink),) = pipeline.sinks
     with pytest.raises(SinkError, match=r"Keep could not write unused: No space left on device"):
         replayed(pipeline, traverse(1000), workers=2)
-    assert len(sink.records) == 5
-    assert sink.summary["verdict"] == "INCOMPLETE"
+    assert len(sink_of(pipeline).records) == 5
+    assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
+
+
+class EndsWith(Log):
+    """A log that raises an exception after its events."""
+
+    def __init__(self, error, events):
+        super().__init__(events)
+        self.error = error
+
+    def events(self, streams):
+        yield from super().events(streams)
+        raise self.error
 
 
 def test_a_log_that_fails_midway_keeps_the_frames_read_before(tmp_path):
-    class Broken(Log):
-        def events(self, streams):
-            yield from super().events(streams)
-            raise OSError("input/output error")
-
-    sink, summary = replayed_log(graph(tmp_path), Broken(traverse(5)))
+    sink, summary = replayed_log(graph(tmp_path), EndsWith(OSError("input/output error"), traverse(5)))
     assert len(sink.values("raised")) == 5
     assert summary["drops"] == {"unreadable": 1}
 
 
 def test_an_interrupt_finishes_frames_in_flight_and_closes_sinks(tmp_path):
-    stop = Stop()
-    pipeline = graph(tmp_path, nap=0.001)
-    ((_, sink),) = pipeline.sinks
+    stop, pipeline = Stop(), graph(tmp_path, nap=0.001)
+    sink = sink_of(pipeline)
 
     def interrupt(whole):
         if len(sink.records) >= 10 and not stop.finishing():
@@ -147,7 +150,7 @@ def test_a_run_under_nohup_outlives_its_terminal():
 
 def test_an_interrupt_after_the_end_of_the_log_loses_no_frame(tmp_path):
     stop, pipeline = Stop(), graph(tmp_path)
-    ((_, sink),) = pipeline.sinks
+    sink = sink_of(pipeline)
 
     def interrupt(whole):
         if len(sink.records) == 5:
@@ -198,10 +201,6 @@ def test_an_interrupt_message_that_fails_does_not_stop_the_run():
         assert stop.abandoning()
 
 
-def lost_frames(summary):
-    return [entry for entry in summary["ledger"] if entry["stream"] in ("left", "both")]
-
-
 def test_a_second_interrupt_does_not_wait_for_a_stage_that_hangs(tmp_path, monkeypatch):
     stop, gate = Stop(), threading.Event()
     pipeline = graph(tmp_path)
@@ -230,9 +229,8 @@ def test_items_that_break_an_aligner_lose_their_frame_not_the_verdict(tmp_path, 
     pipeline = graph(tmp_path)
     monkeypatch.setattr(Number, "pair_with", broken)
     _, summary = replayed(pipeline, traverse(3))
-    assert summary["verdict"] == "INCOMPLETE"
-    assert summary["frames_out"] == 0
-    details = [entry["detail"] for entry in lost_frames(summary)]
+    assert (summary["verdict"], summary["frames_out"]) == ("INCOMPLETE", 0)
+    details = [entry["detail"] for entry in summary["ledger"] if entry["stream"] in ("left", "both")]
     assert all(detail.startswith("TypeError: no such pair (test_run.py, line ") for detail in details)
 
 
@@ -261,16 +259,10 @@ def test_chained_samplers_answer_to_the_end_of_the_log(tmp_path):
 
 
 def test_a_run_that_raises_is_never_marked_complete(tmp_path):
-    class Torn(Log):
-        def events(self, streams):
-            yield from super().events(streams)
-            raise SystemExit
-
     pipeline = graph(tmp_path)
-    ((_, sink),) = pipeline.sinks
     with pytest.raises(SystemExit):
-        replayed_log(pipeline, Torn(traverse(3)))
-    assert sink.summary["verdict"] == "INCOMPLETE"
+        replayed_log(pipeline, EndsWith(SystemExit, traverse(3)))
+    assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
 
 
 def test_a_progress_display_that_fails_does_not_stop_the_run(tmp_path):
@@ -293,15 +285,16 @@ def without_level():
     return Log(traverse(3), missing={"level": "no level"})
 
 
+OPTIONAL_HEIGHT = PIPELINE.replace("at: both}", "at: both, optional: true}")
+
+
 def test_a_log_without_a_needed_stream_is_refused_with_its_reason(tmp_path):
     with pytest.raises(UsageError, match="no level"):
         replayed_log(graph(tmp_path), without_level())
 
 
 def test_an_optional_stage_is_left_out_if_the_log_lacks_its_input(tmp_path):
-    text = PIPELINE
-    for line in ("at: both", "b: height"):
-        text = text.replace(line, f"{line}, optional: true")
+    text = OPTIONAL_HEIGHT.replace("b: height", "b: height, optional: true")
     sink, summary = replayed_log(graph(tmp_path, text=text), without_level())
     assert summary["verdict"] == "COMPLETE"
     assert "raised" not in sink.streams
@@ -310,24 +303,21 @@ def test_an_optional_stage_is_left_out_if_the_log_lacks_its_input(tmp_path):
 
 
 def test_an_optional_port_stays_open_where_the_log_lacks_its_stream(tmp_path):
-    text = PIPELINE.replace("at: both}", "at: both, optional: true}")
-    pipeline = graph(tmp_path, text=text.replace("toys.Add, a: sum, b: h", "toys.Either, a: sum, b: h"))
-    sink, _ = replayed_log(pipeline, without_level())
+    text = OPTIONAL_HEIGHT.replace("toys.Add, a: sum, b: h", "toys.Either, a: sum, b: h")
+    sink, _ = replayed_log(graph(tmp_path, text=text), without_level())
     assert sink.values("raised") == sink.values("sum")
 
 
-@pytest.mark.parametrize("optional", [False, True])
+@pytest.mark.parametrize("optional", ["true", "false"])
 def test_a_stage_without_a_needed_input_is_refused_or_left_out(tmp_path, optional):
-    text = PIPELINE.replace("at: both}", "at: both, optional: true}")
-    either = f"toys.Either, both: true, optional: {str(optional).lower()}, a: sum, b: h"
-    text = text.replace("toys.Add, a: sum, b: h", either)
-    pipeline, log = graph(tmp_path, text=text), without_level()
+    either = f"toys.Either, both: true, optional: {optional}, a: sum, b: h"
+    pipeline = graph(tmp_path, text=OPTIONAL_HEIGHT.replace("toys.Add, a: sum, b: h", either))
     why = "stream 'raised': Either.both needs a `b`, and no level"
-    if optional:
-        assert replayed_log(pipeline, log)[1]["findings"]["raised"]["sentence"] == f"left out: {why}"
+    if optional == "true":
+        assert replayed_log(pipeline, without_level())[1]["findings"]["raised"]["sentence"] == f"left out: {why}"
     else:
         with pytest.raises(UsageError, match=why):
-            replayed_log(pipeline, log)
+            replayed_log(pipeline, without_level())
 
 
 def test_a_message_that_no_stage_reads_is_no_loss(tmp_path):
@@ -373,8 +363,7 @@ def test_an_unprintable_exception_is_not_reported_as_a_sink_error(tmp_path, monk
         raise UnprintableError
 
     pipeline = graph(tmp_path)
-    ((_, sink),) = pipeline.sinks
     monkeypatch.setattr("tests.flow.toys.Scale.__call__", fail)
     with pytest.raises(RuntimeError, match="no words for it"):
         replayed(pipeline, traverse(3))
-    assert sink.summary["verdict"] == "INCOMPLETE"
+    assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
