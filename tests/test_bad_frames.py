@@ -60,13 +60,11 @@ def senseless_tilt(stamp: int, log: Path) -> Change:
     return edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", edit)
 
 
+NO_POINT = "1 failed", "the frame has no measured point within range"
 CASES: dict[str, tuple[Callable[[int, Path], Change], tuple[str, ...]]] = {
-    "clear sky": (images(clear_sky), ("1 failed", "the frame has no measured point within range")),
-    "grainy sky": (images(grainy_sky), ("1 failed", "the frame has no measured point within range")),
-    "burnt out": (
-        images(lambda h, w: np.full((h, w), 255)),
-        ("1 failed", "the frame has no measured point within range"),
-    ),
+    "clear sky": (images(clear_sky), NO_POINT),
+    "grainy sky": (images(grainy_sky), NO_POINT),
+    "burnt out": (images(lambda h, w: np.full((h, w), 255)), NO_POINT),
     "tilt gap": (no_tilt, ("1 unaligned", "inclinometer has a gap of 650 ms, more than 200 ms")),
     "NaN tilt": (senseless_tilt, ("12 unreadable", "the quaternion of the inclinometer is not a rotation", "a gap of")),
 }

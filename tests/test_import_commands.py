@@ -27,9 +27,8 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     for name in ("out", "matched"):
         paths = tmp_path / f"{name}.mcap", tmp_path / f"{name}.json"
         table = said(0, "score", paths[0], "--truth", log, "--json", paths[1]).out
-        assert all(
-            word in table for word in ("bad-0.5", "bad-4", "only one camera sees", "without the leftmost 32 columns")
-        )
+        words = ("bad-0.5", "bad-4", "only one camera sees", "without the leftmost 32 columns")
+        assert all(word in table for word in words)
         assert "missing" not in table  # maps without truth
         scores.append(json.loads(paths[1].read_text())["disparity"])
     for score in scores:

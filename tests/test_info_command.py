@@ -10,11 +10,11 @@ import pytest
 import yaml
 
 from flow.config.templates import SHIPPED
-from recordings.mcap.file import iter_decoded
 from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import read_disparity
 from tests.conftest import FRAMES, edit_of, mcap_rows, rewrite, roverflow, write_mcap
 from tests.recordings.sample_log import INFOS, LEFT, RIGHT, TILT, changed, dropped, replaced, write_sample
+from tests.test_command_line import messages_of
 
 
 def test_info_describes_a_log(traverse, said):
@@ -112,10 +112,7 @@ def test_a_written_pipeline_has_its_source_once_whatever_the_comments_in_it(tmp_
 
 def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
     found = json.loads(said(0, "info", traverse, "--json").out)["search_range"]
-    disparities = [
-        read_disparity(message) for topic, _, message in iter_decoded(traverse) if topic == "/truth/disparity"
-    ]
-    truth = max(float(np.nanmax(disparity)) for disparity in disparities)
+    truth = max(float(np.nanmax(read_disparity(each))) for each in messages_of(traverse, "/truth/disparity"))
     assert 0.9 * found["ground_px"] < truth < found["range_px"]
     enough = f"--set disparities={found['range_px']:.0f}"
     assert f"{enough} includes it" in said(0, "info", traverse, "--set", "disparities=16").out

@@ -12,16 +12,14 @@ from recordings.ros2 import from_msg as ros2
 from stages.data import Cell, CellReason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
 from tests.conftest import FRAMES, SMALL, roverflow
+from tests.test_command_line import messages_of
 
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
 
 
 def test_the_log_has_the_first_and_the_last_regional_map_around_the_rover(result):
-    maps, stamps = {topic: [] for topic in REGIONAL}, {}
-    for topic, stamp, message in iter_decoded(result, REGIONAL | {"/nav/pose"}):
-        stamps.setdefault(topic, []).append(stamp)
-        if topic in REGIONAL:
-            maps[topic].append(message)
+    maps = {topic: messages_of(result, topic) for topic in REGIONAL}
+    stamps = {topic: [stamp for _, stamp, _ in iter_decoded(result, [topic])] for topic in (*REGIONAL, "/nav/pose")}
     written = stamps["/nav/regional_map"]
     assert (written[0], written[-1]) == (stamps["/nav/pose"][0], stamps["/nav/pose"][-1])
     assert stamps["/nav/regional_navigation_map"] == written
@@ -36,10 +34,7 @@ def test_the_log_has_the_first_and_the_last_regional_map_around_the_rover(result
 
 @pytest.mark.parametrize("stream", ["navigation_map", "regional_navigation_map"])
 def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
-    grids, reasons = (
-        [message for _, _, message in iter_decoded(result, [topic])]
-        for topic in (f"/nav/{stream}", f"/nav/{stream}/reason")
-    )
+    grids, reasons = (messages_of(result, topic) for topic in (f"/nav/{stream}", f"/nav/{stream}/reason"))
     assert 2 <= len(grids) == len(reasons) <= FRAMES
     expected = {
         Cell.FREE: {CellReason.CLEAR},
@@ -76,10 +71,8 @@ def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, said):
     with rasterio.open(tmp_path / "maps" / "elevation.tif") as file:
         known = np.isfinite(file.read(1)).sum()
         assert file.shape == cv2.imread(str(tmp_path / "maps" / "navigation_map.pgm"), cv2.IMREAD_UNCHANGED).shape
-    own = [
-        np.isfinite(ros2.read_grid_map(message).layers["elevation"]).sum()
-        for _, _, message in iter_decoded(result, ["/nav/elevation_map"])
-    ]
+    grids = map(ros2.read_grid_map, messages_of(result, "/nav/elevation_map"))
+    own = [np.isfinite(grid.layers["elevation"]).sum() for grid in grids]
     assert max(own) < known < sum(own)
 
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from flow.cli.main import main
-from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import stamp_of
 from recordings.simulator import Simulation, write_log
 from recordings.simulator.traverse import level_pose
+from tests.test_command_line import messages_of
 from tests.tilt_faults import FAULTS, PIPELINE
 
 SLOPES = {21: 4.0, 22: 6.0, 23: 3.0}  # seed -> RMS slope over 1 m, degrees
@@ -71,7 +71,7 @@ def test_a_fault_is_named(log, tmp_path, fault):
 def test_visual_poses_drift_by_less_than_a_hundredth_of_the_distance(log, simulation, tmp_path):
     finding_of(log, tmp_path, 0)
     start, way, before = level_pose(simulation.base_at(simulation.stamp(0))).inverse(), 0.0, np.zeros(3)
-    for _, _, pose in iter_decoded(tmp_path / "out.mcap", ["/nav/pose"]):
+    for pose in messages_of(tmp_path / "out.mcap", "/nav/pose"):
         true = start.after(simulation.base_at(stamp_of(pose.header)))
         way, before = way + float(np.linalg.norm(true.translation - before)), true.translation
         place, turn = pose.pose.pose.position, pose.pose.pose.orientation

@@ -3,6 +3,7 @@
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import plyfile
@@ -16,12 +17,14 @@ from recordings.export.bundle import export, file_names
 from recordings.export.mosaic import Mosaic
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
+from recordings.ros2.from_msg import stamp_of
 from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
 
 START = 1_700_000_000_000_000_000
 STEP = 0.1
 TURN = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # level's x is the region's y
 LEVEL = Transform("odom", "level", TURN, np.array([2.0, -1.0, 0.5]))
+CORNERS = (-1.0, 1.0), (0.0, 1.0)
 
 
 def ground(x: Array, y: Array) -> Array:
@@ -58,30 +61,39 @@ def cloud(frame: int) -> PointCloud:
     return PointCloud(START + frame, level, colors, sigma, np.arange(3, dtype=np.int32), "level")
 
 
+def written(path: Path, *messages: tuple[str, Any]) -> Path:
+    """A log of messages, each at its own stamp."""
+    with Ros2Writer(path) as writer:
+        for topic, message in messages:
+            stamped = message.transforms[0] if topic == "/tf" else message
+            writer.write(topic, message, stamp_of(stamped.header))
+    return path
+
+
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     """A result log of two frames: windows of 30 x 40 cells, the second 1 m farther along x; and their own maps."""
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        for frame, corner in enumerate([(-1.0, 1.0), (0.0, 1.0)]):
-            terrain, navigation = window(frame, corner, (30, 40))
-            stamp = terrain.stamp
-            writer.write("/nav/points", ros2.point_cloud(cloud(frame)), stamp)
-            own = ElevationMap(stamp, terrain.layers, STEP, corner, "level")
-            writer.write("/nav/elevation_map", ros2.grid_map(own), stamp)
-            writer.write("/nav/navigation_map", ros2.occupancy_grid(navigation), stamp)
-            writer.write("/nav/regional_map", ros2.grid_map(terrain), stamp)
-            writer.write("/nav/regional_navigation_map", ros2.occupancy_grid(navigation), stamp)
-            writer.write("/tf", ros2.transform_message([(LEVEL, stamp)]), stamp)
-    return path
+    messages = list[tuple[str, Any]]()
+    for frame, corner in enumerate(CORNERS):
+        terrain, navigation = window(frame, corner, (30, 40))
+        own = ElevationMap(terrain.stamp, terrain.layers, STEP, corner, "level")
+        grid, placed = ros2.occupancy_grid(navigation), ros2.transform_message([(LEVEL, terrain.stamp)])
+        messages += [
+            ("/nav/points", ros2.point_cloud(cloud(frame))), ("/nav/elevation_map", ros2.grid_map(own)),
+            ("/nav/navigation_map", grid), ("/nav/regional_map", ros2.grid_map(terrain)),
+            ("/nav/regional_navigation_map", grid), ("/tf", placed),
+        ]  # fmt: skip
+    return written(tmp_path / "out.mcap", *messages)
 
 
 def regional_log(path: Path, *maps: ElevationMap) -> Path:
     """A result log of regional maps."""
-    with Ros2Writer(path) as writer:
-        for terrain in maps:
-            writer.write("/nav/regional_map", ros2.grid_map(terrain), terrain.stamp)
-    return path
+    return written(path, *(("/nav/regional_map", ros2.grid_map(terrain)) for terrain in maps))
+
+
+def points_in(folder: Path) -> Any:
+    """The points of an exported file."""
+    return plyfile.PlyData.read(str(folder / "points.ply"))["vertex"].data
 
 
 def test_gdal_reads_every_height_at_its_place_and_no_data_in_the_hole(result, tmp_path):
@@ -158,32 +170,27 @@ def test_map_server_reads_free_hazard_and_unknown_at_their_places(result, tmp_pa
 
 def test_each_cell_in_the_ply_has_the_colour_of_its_best_point(result, tmp_path):
     export(result, tmp_path / "out")
-    data = plyfile.PlyData.read(str(tmp_path / "out" / "points.ply"))
-    assert "local frame 'odom'" in data.comments[0]
-    points = data["vertex"].data
+    assert "local frame 'odom'" in plyfile.PlyData.read(str(tmp_path / "out" / "points.ply")).comments[0]
+    points = points_in(tmp_path / "out")
     assert len(points) == 30 * 50 - 1
     np.testing.assert_allclose(points["z"], ground(points["x"], points["y"]), atol=1e-6)
     np.testing.assert_allclose(points["sigma"], 0.02, rtol=1e-5)
-    colours = {
-        (round(float(p["x"]), 2), round(float(p["y"]), 2)): (p["red"], p["green"], p["blue"])
-        for p in points
-        if p["red"] or p["green"] or p["blue"]
-    }
+    rows = zip(*(points[name].tolist() for name in ("x", "y", "red", "green", "blue")), strict=True)
+    colours = {(round(x, 2), round(y, 2)): tuple(colour) for x, y, *colour in rows if any(colour)}
     assert colours == {(1.05, 2.05): (10, 220, 30), (0.45, 2.05): (7, 8, 250)}
 
 
 def test_frames_without_a_regional_map_give_colours_too(tmp_path):
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        for frame in range(3):
-            sent = cloud(frame).only(np.array([frame]))  # each frame has another point
-            if frame != 1:
-                writer.write("/nav/regional_map", ros2.grid_map(window(frame, (-1.0, 1.0), (30, 40))[0]), sent.stamp)
-            writer.write("/nav/points", ros2.point_cloud(sent), sent.stamp)
-            writer.write("/tf", ros2.transform_message([(LEVEL, sent.stamp)]), sent.stamp)
-    export(path, tmp_path / "out")
-    vertices = plyfile.PlyData.read(tmp_path / "out" / "points.ply")["vertex"]
-    assert (10, 220, 30) in set(zip(vertices["red"], vertices["green"], vertices["blue"], strict=True))
+    messages = []
+    for frame in range(3):
+        sent = cloud(frame).only(np.array([frame]))  # each frame has another point
+        if frame != 1:
+            messages.append(("/nav/regional_map", ros2.grid_map(window(frame, CORNERS[0], (30, 40))[0])))
+        messages.append(("/nav/points", ros2.point_cloud(sent)))
+        messages.append(("/tf", ros2.transform_message([(LEVEL, sent.stamp)])))
+    export(written(tmp_path / "out.mcap", *messages), tmp_path / "out")
+    points = points_in(tmp_path / "out")
+    assert (10, 220, 30) in set(zip(points["red"], points["green"], points["blue"], strict=True))
 
 
 def test_the_hillshade_has_light_from_the_north_west_and_a_world_file(tmp_path):
@@ -210,7 +217,7 @@ def test_frames_exports_the_maps_and_points_of_every_frame(result, tmp_path):
     with rasterio.open(tmp_path / "out" / folders[1] / "elevation.tif") as file:
         assert file.bounds == pytest.approx((0.0, 1.0, 4.0, 4.0))
         assert "local frame 'level'" in file.crs.to_wkt()
-    points = plyfile.PlyData.read(str(tmp_path / "out" / folders[1] / "points.ply"))["vertex"].data
+    points = points_in(tmp_path / "out" / folders[1])
     sent = cloud(1)
     np.testing.assert_array_equal(np.column_stack([points[name] for name in "xyz"]), sent.points)
     np.testing.assert_array_equal(np.column_stack([points[name] for name in ("red", "green", "blue")]), sent.colors)
@@ -224,12 +231,8 @@ def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path):
     corner = (500_000.3, 5_400_000.7)
     layers = {"elevation": np.array([[1, 2], [3, np.nan]], np.float32)}
     export(regional_log(tmp_path / "out.mcap", ElevationMap(START, layers, STEP, corner, "map")), tmp_path)
-    points = plyfile.PlyData.read(str(tmp_path / "points.ply"))["vertex"].data
-    centres = [
-        (corner[0] + 0.05, corner[1] + 0.05),
-        (corner[0] + 0.15, corner[1] + 0.05),
-        (corner[0] + 0.05, corner[1] + 0.15),
-    ]
+    points = points_in(tmp_path)
+    centres = np.add(corner, [(0.05, 0.05), (0.15, 0.05), (0.05, 0.15)])
     np.testing.assert_allclose(np.column_stack([points["x"], points["y"]]), centres, atol=1e-6)
     assert points["z"].tolist() == [1, 2, 3]
     with rasterio.open(tmp_path / "elevation.tif") as file:
@@ -237,9 +240,7 @@ def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path):
 
 
 def test_a_log_without_a_regional_map_names_the_remedy(tmp_path):
-    path = tmp_path / "out.mcap"
-    with Ros2Writer(path) as writer:
-        writer.write("/nav/points", ros2.point_cloud(cloud(0)), START)
+    path = written(tmp_path / "out.mcap", ("/nav/points", ros2.point_cloud(cloud(0))))
     with pytest.raises(LogError, match=r"no /nav/regional_map, only /nav/points: .* 'results' .* add --frames"):
         export(path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -250,7 +251,7 @@ def test_a_log_without_a_regional_map_names_the_remedy(tmp_path):
 def test_the_readable_part_of_a_cut_log_is_exported(tmp_path):
     path = tmp_path / "out.mcap"
     with Ros2Writer(path) as writer:
-        for frame, corner in enumerate([(-1.0, 1.0), (0.0, 1.0)]):
+        for frame, corner in enumerate(CORNERS):
             terrain, _ = window(frame, corner, (30, 40))
             writer.write("/nav/regional_map", ros2.grid_map(terrain), terrain.stamp)
             writer.metadata("between", {})  # ends the chunk
@@ -269,9 +270,7 @@ def test_the_readable_part_of_a_cut_log_is_exported(tmp_path):
 
 @pytest.mark.parametrize("frames", [False, True])
 def test_a_log_without_nav_topics_is_refused(tmp_path, frames):
-    path = tmp_path / "raw.mcap"
-    with Ros2Writer(path) as writer:
-        writer.write("/lidar/points", ros2.point_cloud(cloud(0)), START)
+    path = written(tmp_path / "raw.mcap", ("/lidar/points", ros2.point_cloud(cloud(0))))
     with pytest.raises(LogError, match=r"raw\.mcap is not a result log: it has no /nav topics; give the log that "):
         export(path, tmp_path / "out", frames)
 
@@ -336,14 +335,13 @@ def test_file_names_stay_in_the_folder_and_are_unique():
 
 
 def test_maps_are_exported_by_the_names_of_their_streams(tmp_path):
-    path = tmp_path / "out.mcap"
     elevation, navigation = window(0, (0.0, 2.0), (20, 30))
-    with Ros2Writer(path) as writer:
-        writer.write("/nav/sparse/map", ros2.grid_map(elevation), START)
-        writer.write("/nav/sparse/cells", ros2.occupancy_grid(navigation), START)
-        writer.write("/nav/sparse/cells/reason", ros2.reason_map(navigation), START)
-        own = replace(navigation, frame_id="level")
-        writer.write("/nav/frame_cells", ros2.occupancy_grid(own), START)
+    path = written(
+        tmp_path / "out.mcap", ("/nav/sparse/map", ros2.grid_map(elevation)),
+        ("/nav/sparse/cells", ros2.occupancy_grid(navigation)),
+        ("/nav/sparse/cells/reason", ros2.reason_map(navigation)),
+        ("/nav/frame_cells", ros2.occupancy_grid(replace(navigation, frame_id="level"))),
+    )  # fmt: skip
     both = export(path, tmp_path / "both", maps=["sparse/map", "sparse/cells"])
     assert {"elevation.tif", "hillshade.png", "navigation_map.pgm", "points.ply"} <= {file.name for file in both}
     for name, folder in (("sparse/cells", "cells"), ("frame_cells", f"frames/frame-0000-{START}")):

@@ -28,11 +28,8 @@ def scale_at(east):
 
 def driven(result):
     """Stamps, and x and y of the poses of a result."""
-    rows = [
-        (stamp, message.pose.pose.position.x, message.pose.pose.position.y)
-        for _, stamp, message in iter_decoded(result, ["/nav/pose"])
-    ]
-    return [row[0] for row in rows], np.array(rows)[:, 1:]
+    poses = [(stamp, message.pose.pose.position) for _, stamp, message in iter_decoded(result, ["/nav/pose"])]
+    return [stamp for stamp, _ in poses], np.array([(place.x, place.y) for _, place in poses])
 
 
 def write_fixes(path, stamps, places, noise=0.0):

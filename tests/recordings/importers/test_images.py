@@ -36,6 +36,11 @@ def make_pairs(folder: Path, count: int = 3) -> tuple[list[Path], list[Path]]:
     return left, right
 
 
+def imported(folder: Path, pairs: tuple[list[Path], list[Path]], calibration: Any = CALIBRATION, **given: Any) -> Any:
+    """What an import of pairs into a log in the folder returns."""
+    return import_images(*pairs, calibration, folder / "out.mcap", **{"pitch_down": 0.0, "height": 1.0, **given})
+
+
 def events(path: Path) -> list[tuple[int, str, Any]]:
     with McapSource().open(path) as log:
         assert set(log.missing) == {"odometry"}
@@ -43,17 +48,14 @@ def events(path: Path) -> list[tuple[int, str, Any]]:
 
 
 def test_images_are_logged_bit_for_bit_at_the_rate(tmp_path):
-    left, right = make_pairs(tmp_path)
-    out = tmp_path / "out.mcap"
-    assert import_images(left, right, CALIBRATION, out, pitch_down=15, height=0.9, rate=4) == (3, [])
-    read = events(out)
+    assert imported(tmp_path, make_pairs(tmp_path), pitch_down=15, height=0.9, rate=4) == (3, [])
+    read = events(tmp_path / "out.mcap")
     images = {side: [item for _, stream, item in read if stream == side] for side in ("left", "right")}
     for number in range(3):
         np.testing.assert_array_equal(images["left"][number].pixels, picture(2 * number))
         np.testing.assert_array_equal(images["right"][number].pixels, picture(2 * number + 1))
         frame = images["left"][number].pair_with(images["right"][number])
-        assert frame.camera.baseline == pytest.approx(0.25)
-        assert frame.camera.raw is None
+        assert (frame.camera.baseline, frame.camera.raw) == (pytest.approx(0.25), None)
     stamps = [item.stamp for item in images["left"]]
     assert np.diff(stamps).tolist() == [250_000_000] * 2
     tilts = [item.stamp for _, stream, item in read if stream == "inclinometer"]
@@ -64,22 +66,16 @@ def test_images_are_logged_bit_for_bit_at_the_rate(tmp_path):
 
 @pytest.mark.parametrize(("pitch_down", "roll"), [(0, 0), (14.5, 0), (20, 10), (5, -30)])
 def test_the_camera_has_the_given_attitude(tmp_path, pitch_down, roll):
-    left, right = make_pairs(tmp_path, 1)
-    out = tmp_path / "out.mcap"
-    import_images(left, right, CALIBRATION, out, pitch_down=pitch_down, roll=roll, height=0.88)
-    read = events(out)
-    mount = next(item for _, stream, item in read if stream == "mount")
-    tilt = next(item for _, stream, item in read if stream == "inclinometer")
+    imported(tmp_path, make_pairs(tmp_path, 1), pitch_down=pitch_down, roll=roll, height=0.88)
+    read = events(tmp_path / "out.mcap")
+    mount, tilt = (next(item for _, name, item in read if name == stream) for stream in ("mount", "inclinometer"))
     up = mount.camera_from_inclinometer @ tilt.up  # in camera axes: x right, y down, z forward
     assert np.degrees(np.arcsin(up[2])) == pytest.approx(-pitch_down)  # the line of sight is below the horizon
-    assert np.degrees(np.arctan2(up[0], -up[1])) == pytest.approx(
-        -roll, abs=1e-9
-    )  # x, to the right, is below for roll > 0
+    leaning = np.degrees(np.arctan2(up[0], -up[1]))
+    assert leaning == pytest.approx(-roll, abs=1e-9)  # x, to the right, is below for roll > 0
     np.testing.assert_allclose(mount.base_from_camera.translation, [0, 0, 0.88])
-    forward = mount.base_from_camera.rotation @ [0, 0, 1]
-    np.testing.assert_allclose(
-        forward, [np.cos(np.radians(pitch_down)), 0, -np.sin(np.radians(pitch_down))], atol=1e-12
-    )
+    down, forward = np.radians(pitch_down), mount.base_from_camera.rotation @ [0, 0, 1]
+    np.testing.assert_allclose(forward, [np.cos(down), 0, -np.sin(down)], atol=1e-12)
 
 
 @pytest.mark.parametrize(("names", "left"), [
@@ -132,10 +128,9 @@ def test_no_image_is_left_out_silently(tmp_path, names, sentence):
     ({"width": 640}, "is 24x16, but the calibration is for 640x16"),
 ])  # fmt: skip
 def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path, change, sentence):
-    left, right = make_pairs(tmp_path, 1)
     calibration = {k: v for k, v in {**CALIBRATION, "height": 16, **change}.items() if v is not None}
     with pytest.raises(LogError, match=sentence):
-        import_images(left, right, calibration, tmp_path / "out.mcap", pitch_down=0, height=1)
+        imported(tmp_path, make_pairs(tmp_path, 1), calibration)
     assert not list(tmp_path.glob("out*"))
 
 
@@ -146,26 +141,23 @@ def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path, change, sen
     ("rate", (0.0, np.inf, np.nan, 1e-12, 1e10), "rate .*must be"),
 ])  # fmt: skip
 def test_an_impossible_attitude_height_or_rate_is_refused(tmp_path, option, values, sentence):
-    left, right = make_pairs(tmp_path, 1)
+    pairs = make_pairs(tmp_path, 1)
     for value in values:
         with pytest.raises(LogError, match=sentence):
-            import_images(
-                left, right, CALIBRATION, tmp_path / "out.mcap", **{"pitch_down": 0.0, "height": 1.0, option: value}
-            )
+            imported(tmp_path, pairs, **{option: value})
     assert not list(tmp_path.glob("out*"))
-    import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1, rate=1e9)
+    imported(tmp_path, pairs, rate=1e9)
 
 
 def test_the_calibration_may_be_a_file(tmp_path):
-    left, right = make_pairs(tmp_path, 1)
-    file = tmp_path / "camera.yaml"
+    pairs, file = make_pairs(tmp_path, 1), tmp_path / "camera.yaml"
     file.write_text("fx: 20\nfy: 21.5\ncx: 11\ncy: 7\ncx_right: 13\nbaseline: 0.25\n")
-    import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
+    imported(tmp_path, pairs, file)
     camera = frame_of(tmp_path / "out.mcap").camera
     assert (camera.fy, camera.cx, camera.cx_right) == (21.5, 11.0, 13.0)
     file.write_text("fx: [")
     with pytest.raises(LogError, match="cannot be read as YAML"):
-        import_images(left, right, file, tmp_path / "out.mcap", pitch_down=0, height=1)
+        imported(tmp_path, pairs, file)
 
 
 def test_pairs_that_are_not_rectified_have_the_calibration_of_its_files_and_end_up_row_aligned(tmp_path):
@@ -199,44 +191,42 @@ def row_offset(frame):
 
 
 def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tmp_path):
-    left, right = make_pairs(tmp_path, 1)
+    _, right = pairs = make_pairs(tmp_path, 1)
     lens = {"D1": [[0.01, 0, 0, 0]], "D2": [[0.02, 0, 0, 0]], "R": np.eye(3).tolist(), "T": [-0.25, 0, 0]}
     lens |= {name: [[20.0, 0, 11.5], [0, 20.0, 7.5], [0, 0, 1.0]] for name in ("M1", "M2")}
     (file := tmp_path / "stereo.yaml").write_text(yaml.safe_dump(lens))
-    import_images(left, right, file, tmp_path / "out.mcap", pitch_down=10, height=1)
+    imported(tmp_path, pairs, file)
     camera = frame_of(tmp_path / "out.mcap").camera
     assert camera.baseline == pytest.approx(0.25)
     assert [model.d[0] for model in camera.raw] == [0.01, 0.02]
     save(right[0], picture(0)[:8])
     with pytest.raises(LogError, match="is 24x8, but the calibration is for 24x16"):
-        import_images(left, right, file, tmp_path / "other.mcap", pitch_down=10, height=1)
+        imported(tmp_path, pairs, file)
 
 
 def test_a_colour_image_may_have_a_gray_partner(tmp_path):
-    left, right = make_pairs(tmp_path, 1)
+    _, right = pairs = make_pairs(tmp_path, 1)
     save(right[0], cv2.cvtColor(picture(1), cv2.COLOR_RGB2GRAY))
     assert picture(0).ndim == 3
-    assert import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1) == (1, [])
+    assert imported(tmp_path, pairs) == (1, [])
     frame = frame_of(tmp_path / "out.mcap")
     assert (frame.left.shape, frame.right.shape) == ((16, 24, 3), (16, 24))
 
 
 def test_images_of_two_sizes_and_other_files_are_refused(tmp_path):
-    left, right = make_pairs(tmp_path, 1)
+    _, right = pairs = make_pairs(tmp_path, 1)
     save(right[0], picture(0)[:8])
     with pytest.raises(LogError, match="differ in size or depth"):
-        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
+        imported(tmp_path, pairs)
     right[0].write_bytes(b"no picture")
     with pytest.raises(LogError, match=r"0-right\.png is not a readable image"):
-        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", pitch_down=0, height=1)
+        imported(tmp_path, pairs)
 
 
 def test_images_are_read_as_the_log_is_written(tmp_path, monkeypatch):
-    left, right = make_pairs(tmp_path)
-    read, so_far = set(), []
+    pairs, read, so_far = make_pairs(tmp_path), set(), []
     monkeypatch.setattr(files, "read_bytes", lambda path: read.add(path.name) or path.read_bytes())
-    given = {"pitch_down": 0, "height": 1, "progress": lambda done: so_far.append(len(read))}
-    assert import_images(left, right, CALIBRATION, tmp_path / "out.mcap", **given) == (3, [])
+    assert imported(tmp_path, pairs, progress=lambda done: so_far.append(len(read))) == (3, [])
     assert so_far == [2, 4, 6]
 
 
@@ -286,9 +276,7 @@ def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
     ("name,pitch_down\n0-left,200\n", "line 2: pitch_down must be at most 180 deg"),
 ], ids=range(6))  # fmt: skip
 def test_attitudes_that_are_none_are_refused(tmp_path, text, words):
-    left, right = make_pairs(tmp_path, 1)
     (tmp_path / "attitudes.csv").write_text(text)
-    given = {"pitch_down": 0.0, "height": 1.0, "attitudes": tmp_path / "attitudes.csv"}
     with pytest.raises(LogError, match=words):
-        import_images(left, right, CALIBRATION, tmp_path / "out.mcap", **given)
+        imported(tmp_path, make_pairs(tmp_path, 1), attitudes=tmp_path / "attitudes.csv")
     assert not list(tmp_path.glob("out*"))

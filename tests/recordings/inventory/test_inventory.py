@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ from tests.recordings.sample_log import (
     TILT,
     TRANSFORMS,
     UNSTAMPED,
+    Edit,
     changed,
     dropped,
     inventory_of,
@@ -43,6 +45,11 @@ def description(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     path = write_sample(tmp_path_factory.mktemp("log") / "sample.mcap")
     described: dict[str, Any] = json.loads(json.dumps(inventory_of(path)))
     return described
+
+
+def text_of(folder: Path, *edits: Edit) -> str:
+    """What `info` prints of the sample with edits."""
+    return format_description(inventory_of(write_sample(folder / "log.mcap", *edits)))
 
 
 def test_rates_and_gaps_are_those_of_the_log(description):
@@ -65,8 +72,7 @@ def test_calibration_transforms_and_pairs_are_reported(description):
 
 
 def test_the_text_lists_topics_streams_and_missing_streams(tmp_path):
-    path = write_sample(tmp_path / "log.mcap", dropped("/odom"))
-    text = format_description(inventory_of(path))
+    text = text_of(tmp_path, dropped("/odom"))
     line = next(line for line in text.splitlines() if line.startswith(LEFT))
     columns = [LEFT, "sensor_msgs/msg/Image", "5", "10.00", "0.100 s", "left (the only stereo pair)"]
     assert re.split(r"  +", line) == columns
@@ -77,8 +83,8 @@ def test_the_text_lists_topics_streams_and_missing_streams(tmp_path):
 
 def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path):
     later = [
-        changed(RIGHT, {"header.stamp.nanosec": lambda time: time + 6_000_000}, [1]),
-        changed(RIGHT, {"header.stamp.nanosec": lambda time: time + 4_000_000}, [2]),
+        changed(RIGHT, {"header.stamp.nanosec": lambda time, by=by: time + by}, [number])
+        for number, by in ((1, 6_000_000), (2, 4_000_000))
     ]
     path = write_sample(tmp_path / "log.mcap", *later, dropped(TILT, numbers=[1, 2, 3]))
     frames = inventory_of(path)["frames"]
@@ -113,7 +119,7 @@ def test_images_of_a_second_camera_on_a_topic_are_not_usable(tmp_path, monkeypat
 
 
 def test_without_cameras_no_pairs_are_reported(tmp_path):
-    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", dropped(*INFOS))))
+    text = text_of(tmp_path, dropped(*INFOS))
     assert "missing: left: no CameraInfo belongs to" in text
     assert "frames:" not in text
 
@@ -128,28 +134,24 @@ def test_only_sentences_about_single_messages_are_counted_together():
 def test_similar_tilt_errors_are_grouped_in_one_line(tmp_path):
     zero = changed(TILT, {f"orientation.{name}": 0.0 for name in "xyzw"}, range(1, FRAMES))
     other = changed(TILT, {"orientation.w": 0.25}, range(3, FRAMES))
-    described = inventory_of(write_sample(tmp_path / "log.mcap", zero, other))
-    (line,) = (line for line in format_description(described).splitlines() if line.startswith("damaged"))
-    assert line.startswith(
-        f"damaged: 4 similar, first: {TILT} at {START + PERIOD} ns: the quaternion of the inclinometer"
-    )
+    (line,) = (line for line in text_of(tmp_path, zero, other).splitlines() if line.startswith("damaged"))
+    which = f"4 similar, first: {TILT} at {START + PERIOD} ns: the quaternion of the inclinometer"
+    assert line.startswith(f"damaged: {which}")
 
 
 def test_streams_without_stamps_are_noted(tmp_path):
     described = inventory_of(write_sample(tmp_path / "log.mcap", changed((LEFT, "/odom"), UNSTAMPED)))
     assert list(described["notes"]) == ["left", "odometry"]
-    assert [line for line in format_description(described).splitlines() if line.startswith("note: ")] == [
-        "note: left: the header stamps are 0, so log times are used",
-        "note: odometry: the header stamps are 0, so log times are used",
-    ]
+    shown = [line for line in format_description(described).splitlines() if line.startswith("note: ")]
+    sentence = "the header stamps are 0, so log times are used"
+    assert shown == [f"note: {stream}: {sentence}" for stream in ("left", "odometry")]
 
 
 def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
-    for lateness, doubted in ((0, False), (2, True)):
-        earlier = changed(TILT, {"header.stamp.sec": lambda seconds, by=lateness: seconds - by})
-        text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", earlier)))
-        doubt = "doubtful: from stamp to log, tilts take 2.0 s longer than images; if no clock is wrong"
-        assert (doubt in text) == doubted
+    doubt = "doubtful: from stamp to log, tilts take 2.0 s longer than images; if no clock is wrong"
+    earlier = changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 2})
+    assert doubt in text_of(tmp_path, earlier)
+    assert doubt not in text_of(tmp_path)
 
 
 @pytest.mark.parametrize("seconds", [100, -37])
@@ -173,27 +175,18 @@ def test_images_that_a_wider_tolerance_would_pair_are_doubted(tmp_path, offset, 
 
 
 def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
-    path = write_sample(tmp_path / "log.mcap", changed("camera_info", {"width": 60, "height": 32}))
     doubt = "cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
-    assert f"doubtful: {doubt}" in format_description(inventory_of(path))
+    assert f"doubtful: {doubt}" in text_of(tmp_path, changed("camera_info", {"width": 60, "height": 32}))
+
+
+BESIDE = "the static transform 'left_optical' <- 'right_optical'"
 
 
 @pytest.mark.parametrize(("errors", "told_by_transform", "note"), [
     (BASELINE, BASELINE * 1.04, ""),
-    (
-        BASELINE, BASELINE * 1.06,
-        (
-            "the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by the static transform "
-            "'left_optical' <- 'right_optical'; correct the wrong one"
-        ),
-    ),
-    (
-        0.0, 0.3,
-        (
-            "the baseline of 0.3 m comes from the static transform 'left_optical' <- 'right_optical', because "
-            "P[0,3] of both CameraInfo is 0"
-        ),
-    ),
+    (BASELINE, BASELINE * 1.06,
+     f"the baseline is 0.25 m by P of the CameraInfo, which is used, but 0.265 m by {BESIDE}; correct the wrong one"),
+    (0.0, 0.3, f"the baseline of 0.3 m comes from {BESIDE}, because P[0,3] of both CameraInfo is 0"),
 ])  # fmt: skip
 def test_a_baseline_from_or_against_the_transform_is_noted(tmp_path, errors, told_by_transform, note):
     beside = Transform("left_optical", "right_optical", np.eye(3), [told_by_transform, 0, 0])
@@ -211,14 +204,11 @@ def test_a_baseline_from_or_against_the_transform_is_noted(tmp_path, errors, tol
 
 
 def test_a_missing_right_calibration_is_reported(tmp_path):
-    edit = dropped("/stereo/right/camera_info")
-    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
+    text = text_of(tmp_path, dropped("/stereo/right/camera_info"))
     listed = "the log's CameraInfo topics are /stereo/left/camera_info"
-    why = f"no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'"
-    assert [line.partition(" of the source")[0] for line in text.splitlines() if line.startswith("missing")] == [
-        f"missing: right: {why}",
-        "missing: mount: the mount needs a calibrated pair of cameras",
-    ]
+    missing = [line.partition(" of the source")[0] for line in text.splitlines() if line.startswith("missing")]
+    mount = "missing: mount: the mount needs a calibrated pair of cameras"
+    assert missing == [f"missing: right: no CameraInfo belongs to {RIGHT} ({listed}); set 'right_info'", mount]
 
 
 def test_undecodable_topics_are_listed_once(tmp_path):
@@ -231,8 +221,7 @@ def test_undecodable_topics_are_listed_once(tmp_path):
 
 
 def test_singular_and_plural_are_correct(tmp_path):
-    one = dropped("", numbers=range(1, FRAMES))
-    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", one)))
+    text = text_of(tmp_path, dropped("", numbers=range(1, FRAMES)))
     assert "1 stereo pair (stamps within 5 ms) from 1 left image and 1 right image; 1 left image with" in text
 
 

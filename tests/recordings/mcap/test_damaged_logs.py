@@ -29,11 +29,28 @@ from recordings.mcap.chunk import unpack_chunk
 from recordings.mcap.file import McapFile
 from recordings.mcap.index import MAGIC, Index
 from tests.conftest import chunks_of, data_folder, rewrite, with_broken, write_mcap
-from tests.recordings.sample_log import LAYOUTS, LEFT, PERIOD, RIGHT, START, essences, inventory_of, items_of, sound
+from tests.recordings.sample_log import (
+    LAYOUTS,
+    LEFT,
+    PERIOD,
+    RIGHT,
+    START,
+    essences,
+    inventory_of,
+    items_of,
+    losses_in,
+    sound,
+)
 
 
 def record(opcode: int, content: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def stored(sample: Path, folder: Path, layout: str) -> bytearray:
+    """The content of full.mcap, the sample in a layout."""
+    full = folder / "full.mcap"
+    return bytearray((full if full.exists() else rewrite(sample, full, **LAYOUTS[layout])).read_bytes())
 
 
 def times_of(full: Path, first: int, last: float) -> tuple[float, float]:
@@ -75,13 +92,11 @@ def check_nothing_is_lost_silently(path: Path, whole: list[tuple[int, str, Any]]
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True))
 def test_a_cut_log_loses_only_the_part_after_the_cut(sample, whole, tmp_path, layout, share):
-    full = tmp_path / "full.mcap"
-    if not full.exists():
-        rewrite(sample, full, **LAYOUTS[layout])
-    content = full.read_bytes()
+    content = stored(sample, tmp_path, layout)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(content[: int(share * len(content))])
-    check_nothing_is_lost_silently(cut, whole, times_of(full, int(share * len(content)), math.inf))
+    harmed = times_of(tmp_path / "full.mcap", int(share * len(content)), math.inf)
+    check_nothing_is_lost_silently(cut, whole, harmed)
 
 
 def test_messages_before_the_cut_in_a_chunk_are_rescued(sample, whole, tmp_path):
@@ -100,15 +115,12 @@ def test_messages_before_the_cut_in_a_chunk_are_rescued(sample, whole, tmp_path)
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 @example(share=0.8027289957765081, bit=0)  # a log time in the index, which no CRC covers
 def test_a_flipped_bit_never_becomes_data(sample, whole, tmp_path, layout, share, bit):
-    full = tmp_path / "full.mcap"
-    if not full.exists():
-        rewrite(sample, full, **LAYOUTS[layout])
-    content = bytearray(full.read_bytes())
+    content = stored(sample, tmp_path, layout)
     place = int(share * len(content))
     content[place] ^= 1 << bit
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(content)
-    check_nothing_is_lost_silently(damaged, whole, times_of(full, place, place + 1))
+    check_nothing_is_lost_silently(damaged, whole, times_of(tmp_path / "full.mcap", place, place + 1))
 
 
 def test_a_broken_chunk_loses_its_own_messages_with_their_times(sample, whole, tmp_path):
@@ -144,10 +156,9 @@ def test_a_broken_record_length_loses_that_record(sample, whole, tmp_path):
     path = tmp_path / "damaged.mcap"
     path.write_bytes(content)
     events = items_of(path)
-    losses = [str(item) for _, _, item in events if isinstance(item, Exception)]
-    assert losses == [
-        f"damaged.mcap: the log is damaged from byte {chunks[3]} to byte {chunks[4]}; messages there may be lost"
-    ]
+    ((_, _, lost),) = losses_in(events)
+    where = f"from byte {chunks[3]} to byte {chunks[4]}"
+    assert lost == f"damaged.mcap: the log is damaged {where}; messages there may be lost"
     assert sound(events) == essences(whole)  # the chunk itself was whole
 
 
@@ -237,9 +248,8 @@ def test_bytes_after_the_end_of_a_log_are_reported(sample, whole, tmp_path, layo
     *events, (_, stream, lost) = items_of(path)
     assert essences(events) == essences(whole)
     size = len(first) if second == "log" else 5000
-    sentence = (
-        f"the log ends at byte {len(first)}, and the {size} bytes after it are not read; give each log as its own file"
-    )
+    sentence = f"the log ends at byte {len(first)}, and the {size} bytes after it are not read; "
+    sentence += "give each log as its own file"
     assert (stream, str(lost)) == ("log", f"log.mcap: {sentence}")
     assert inventory_of(path)["damage"] == [sentence]
 
@@ -312,9 +322,8 @@ def test_messages_of_an_undefined_channel_are_reported(tmp_path):
     with McapFile(log) as file:
         found = list(file.messages({known}))
     assert [item.log_time for item in found if not isinstance(item, LostMessage)] == [1, 3]
-    assert [item.reason for item in found if isinstance(item, LostMessage)] == [
-        "1 message of channel 999 cannot be read: the log does not define it"
-    ]
+    (lost,) = (item.reason for item in found if isinstance(item, LostMessage))
+    assert lost == "1 message of channel 999 cannot be read: the log does not define it"
 
 
 def test_the_starts_of_short_messages_in_one_chunk_are_their_own(tmp_path):

@@ -211,9 +211,8 @@ def test_a_result_with_no_comparable_message_is_not_scored(tmp_path, truth, fram
 
 
 def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
-    widths = [
-        math.ceil(np.nanmax(ground_truth.true_disparity(SMALL, 0, frame).pixels) / 16) * 16 for frame in frames
-    ]  # fmt: skip
+    largest = [np.nanmax(truth_of(index)[0].pixels) for index in range(SMALL.frames)]
+    widths = [math.ceil(disparity / 16) * 16 for disparity in largest]
     found = scored(tmp_path, truth, frames).disparity["cropped_image"]
     assert found["leftmost_columns_cropped"] == sorted(set(widths))
     kept = [(frame.seen == 255)[:, width:].sum() for frame, width in zip(frames, widths, strict=True)]

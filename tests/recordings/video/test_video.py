@@ -11,7 +11,7 @@ from recordings.errors import LogError
 from recordings.video.formats import FrameNumbers, is_key_frame
 from stages.data import CameraImage
 from tests.conftest import rewrite
-from tests.recordings.sample_log import LEFT, items_of
+from tests.recordings.sample_log import LEFT, items_of, missing_in
 from tests.recordings.video.encoder import KEY_INTERVAL, Encoder, gray_of, video_log
 
 FORMATS = ("h264", "h265")
@@ -73,10 +73,7 @@ def test_key_frames_and_gaps_are_found_in_the_bytes(video):
 def test_video_without_its_library_is_refused_with_the_remedy(sample, tmp_path, monkeypatch):
     log = video_log(sample, tmp_path / "log.mcap", "h264")
     monkeypatch.setattr("recordings.video.formats.find_spec", lambda name: None)
-    with McapSource().open(log) as opened:
-        assert (
-            opened.missing["left"]
-            == f"{LEFT}: compressed video needs PyAV; install it by `pip install '.[video]'` in roverflow's folder"
-        )
+    remedy = "install it by `pip install '.[video]'` in roverflow's folder"
+    assert missing_in(log)["left"] == f"{LEFT}: compressed video needs PyAV; {remedy}"
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
     assert [line[:4] for line in project["optional-dependencies"]["video"]] == ["av>="]
