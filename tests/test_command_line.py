@@ -143,9 +143,9 @@ def test_a_row_offset_is_measured_once_for_the_log_reported_and_corrected(traver
 
 def test_the_result_reads_back_with_rosbags(result):
     with AnyReader([result]) as reader:
-        topics = [(each.topic, reader.deserialize(data, each.msgtype)) for each, _, data in reader.messages()]
-    assert len(topics) == len(raw_messages(result))
-    disparity = next(message for topic, message in topics if topic == "/nav/disparity")
+        messages = [(each.topic, reader.deserialize(data, each.msgtype)) for each, _, data in reader.messages()]
+    assert len(messages) == len(raw_messages(result))
+    disparity: Any = dict(messages)["/nav/disparity"]
     assert disparity.image.encoding == "32FC1"
 
 
