@@ -1,8 +1,12 @@
 """Pairs of images for the tests of matchers: textured surfaces whose disparities are known."""
 
+import hashlib
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
+from stages import Match
 from stages.data import PixelOrigin, StereoCamera, StereoFrame
 
 
@@ -17,7 +21,7 @@ def textured(height, width, seed=0):
     return np.clip((smooth - 127) * 3 + 127, 0, 255)
 
 
-def slanted_pair(height=200, width=320, near=34.0, far=6.0):
+def slanted(height=200, width=320, near=34.0, far=6.0):
     """A pair that sees a plane, d growing downwards from `far` to `near`, and its true disparities (H, W)."""
     wide = textured(height, width + 80)
     y, x = np.mgrid[:height, :width].astype(np.float32)
@@ -28,12 +32,44 @@ def slanted_pair(height=200, width=320, near=34.0, far=6.0):
     return frame_of(left, right), disparity
 
 
-def check_in_view(result, least, most):
-    """Known disparities lie within these and their partners in the right image; no other pixel has a confidence."""
+SLOPE, TRUTH = slanted()
+_right = SLOPE.right.copy()
+_right[60:120, 100:200] = textured(60, 100, seed=5)
+SPOILED = replace(SLOPE, right=_right)  # a patch differs between its images
+
+
+def accuracy(pixels, truth, where=np.s_[:]):
+    """Share of these pixels that are known, the median of their errors, px, and the share of errors above 1 px."""
+    error = np.abs(pixels - truth)[where]
+    known = error[np.isfinite(error)]
+    return known.size / error.size, np.median(known), (known > 1).mean()
+
+
+def digest():
+    """SHA-256 of the disparities of several searches, hexadecimal."""
+    frame, _ = slanted(height=64, width=100)
+    first = Match(disparities=40)(frame)
+    others = Match(search_radius=4), Match(disparities=128, band_height=32)
+    results = [first, *(match(frame, first) for match in others)]
+    return hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).hexdigest()
+
+
+REASONS = range(PixelOrigin.OUT_OF_VIEW, PixelOrigin.BLANK + 1)  # why a pixel is not matched
+
+
+def same(one, other):
+    """Whether two disparities have the same bits."""
+    layers = "pixels", "source", "confidence"
+    return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in layers)
+
+
+def check_view(result, least, most, reasons=REASONS):
+    """Known disparities lie within these and their partners in the right image; any other pixel has a reason alone."""
     known = np.isfinite(result.pixels)
     partner = (np.arange(known.shape[1]) - result.pixels)[known]
     assert ((partner >= 0) & (partner <= known.shape[1] - 1)).all()
     assert ((result.pixels[known] >= least) & (result.pixels[known] <= most)).all()
     assert np.array_equal(result.source == PixelOrigin.MEASURED, known)
     assert (result.confidence[~known] == 0).all()
+    assert np.isin(result.source[~known], reasons).all()
     return known

@@ -5,16 +5,9 @@ import pytest
 from numba import njit
 
 from stages.compiled.simd import Width
+from stages.matching.kernels import gradient
 from stages.matching.kernels.census import census, census_reference
-from stages.matching.kernels.gradient import (
-    follow_slope,
-    gradients,
-    gradients_reference,
-    set_aside,
-    smoothed_costs,
-    smoothed_costs_reference,
-    steep_slope,
-)
+from stages.matching.kernels.gradient import gradients, gradients_reference, smoothed_costs_reference, steep_slope
 from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.row_ranges import lanes_for
 from stages.matching.kernels.sgm_params import SgmParams
@@ -27,13 +20,13 @@ def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
     height, spare = costs.shape[0], np.empty(costs.shape[1], np.uint8)
     first = 0 if step > 0 else height - 1
     for ahead in (first - step, first):
-        smoothed_costs(inputs, unseen_cost, 0, ahead, sums, costs[first], width)
+        gradient.smoothed_costs(inputs, unseen_cost, 0, ahead, sums, costs[first], width)
     for i in range(height):
         y = first + i * step
         slope = inputs.slope[y if inputs.slope.size > 0 else 0]
-        set_aside(slope, step, sums[y + step & 1], spare, width)
-        smoothed_costs(inputs, unseen_cost, 0, y + step, sums, costs[y], width)
-        follow_slope(slope, step, spare, sums[y + step & 1], sums[y & 1], costs[y], width)
+        gradient.set_aside(slope, step, sums[y + step & 1], spare, width)
+        gradient.smoothed_costs(inputs, unseen_cost, 0, y + step, sums, costs[y], width)
+        gradient.follow_slope(slope, step, spare, sums[y + step & 1], sums[y & 1], costs[y], width)
 
 
 def params_of(disparities, minimum):

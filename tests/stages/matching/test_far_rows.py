@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stages import Disparity, Halve, Match, Refine, StereoCamera, StereoFrame, Upsample
+from stages import Halve, Match, PixelOrigin, Refine, StereoCamera, StereoFrame, Upsample
 from stages.data.rows import disparity_rows, frame_rows, with_rows
 from stages.matching.far_rows import far_rows
 from stages.matching.kernels.row_ranges import count_in_rows, count_in_rows_reference
+from tests.stages.builders import disparity_of
 
 CAMERA = StereoCamera(fx=200, fy=200, cx=60, cy=48, baseline=0.2, width=120, height=96, cx_right=61)
 SCALE = CAMERA.fx * CAMERA.baseline
@@ -17,11 +18,9 @@ IMAGE = RNG.integers(0, 256, (96, 140), np.uint8)
 FRAME = StereoFrame(7, IMAGE[:, :120].copy(), IMAGE[:, 9:129].copy(), CAMERA)  # a wall: 9 px everywhere
 
 
-def disparity(pixels: np.ndarray, sigma: float | None = None, source: int = 1) -> Disparity:
+def disparity(pixels, sigma=None, source=PixelOrigin.MEASURED):
     sigmas = None if sigma is None else np.full(pixels.shape, sigma, np.float32)
-    known = np.isfinite(pixels)
-    return Disparity(7, pixels.astype(np.float32), (source * known).astype(np.uint8), known.astype(np.float32),
-                     camera=CAMERA, sigma=sigmas)  # fmt: skip
+    return disparity_of(pixels, source * np.isfinite(pixels), stamp=7, camera=CAMERA, sigma=sigmas)
 
 
 def ground(first_depth: float = 20.0, last_depth: float = 0.5) -> np.ndarray:
@@ -46,7 +45,7 @@ def test_specks_and_guesses_move_no_limit_and_a_far_corner_does():
     assert far_rows(disparity(pixels), CAMERA, 0.1, 8.0) == plain
     pixels[90, :40] = 3
     assert far_rows(disparity(pixels), CAMERA, 0.1, 0.0) == (0, 91)
-    assert far_rows(disparity(ground(), source=3), CAMERA, 0.1, 8.0) == (0, 0)  # filled
+    assert far_rows(disparity(ground(), source=PixelOrigin.FILLED), CAMERA, 0.1, 8.0) == (0, 0)
 
 
 def test_counts_of_rows_equal_the_reference():

@@ -1,6 +1,5 @@
 """Matching: right on a synthetic truth, silent where there is no evidence, the same bits on any threads and memory."""
 
-import hashlib
 import os
 import subprocess
 import sys
@@ -16,31 +15,16 @@ from hypothesis import strategies as st
 
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
-from stages.data import Disparity, PixelOrigin, StereoFrame
+from stages.data import PixelOrigin, StereoFrame
 from stages.matching.match import CONFIDENCES, LEADS, Match
 from stages.matching.match_opencv import MatchOpenCV
 from tests.bench.stereo_scores import load_scene, rows_filled
 from tests.conftest import data_folder
-from tests.stages.matching.pairs import check_in_view, frame_of, slanted_pair, textured
+from tests.stages.builders import disparity_of
+from tests.stages.matching.pairs import SLOPE, TRUTH, accuracy, check_view, digest, frame_of, same, slanted, textured
 
 ROOT = Path(__file__).parents[3]
-REASONS = range(PixelOrigin.OUT_OF_VIEW, PixelOrigin.BLANK + 1)
-LAYERS = "pixels", "source", "confidence"
-
-
-def same(one, other):
-    return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in LAYERS)
-
-
-@pytest.fixture(scope="module")
-def slope():
-    return slanted_pair()
-
-
-def in_colour(frame):
-    return replace(frame, left=np.dstack([frame.left] * 3), right=np.dstack([frame.right] * 3))
-
-
+COLOURED = replace(SLOPE, left=np.dstack([SLOPE.left] * 3), right=np.dstack([SLOPE.right] * 3))
 MATCHERS = Match(disparities=48), MatchOpenCV(disparities=48)
 
 
@@ -49,50 +33,41 @@ MATCHERS = Match(disparities=48), MatchOpenCV(disparities=48)
     *((MatchOpenCV(disparities=48, paths=paths, color=color), 0, 0.95, 0.15)
       for color in (False, True) for paths in (3, 5, 8)),
 ])  # fmt: skip
-def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(slope, match, border, share, largest):
-    frame, truth = slope
-    frame = in_colour(frame) if getattr(match, "color", False) else frame
+def test_a_slanted_plane_is_measured_to_a_fraction_of_a_pixel(match, border, share, largest):
+    frame = COLOURED if getattr(match, "color", False) else SLOPE
     result = match(frame)
-    visible = np.arange(320) >= truth + border
-    known = np.isfinite(result.pixels)
-    assert known[visible].mean() > share
-    error = np.abs(result.pixels - truth)[known & visible]
-    assert np.median(error) < largest
-    assert (error > 1).mean() < 0.01
-    assert (result.stamp, result.camera) == (frame.stamp, frame.camera)
+    known, error, wrong = accuracy(result.pixels, TRUTH, np.arange(320) >= TRUTH + border)
+    assert known > share
+    assert error < largest
+    assert wrong < 0.01
+    assert (result.stamp, result.camera) == (SLOPE.stamp, SLOPE.camera)
 
 
 @pytest.mark.parametrize("search", [{}, {"search_radius": 4}])
 def test_a_steep_slope_has_fewer_errors_where_the_cost_follows_it(search):
-    frame, truth = slanted_pair(height=60, near=50.0, far=8.0)  # 0.7 px a row
+    frame, truth = slanted(height=60, near=50.0, far=8.0)  # 0.7 px a row
     noise = np.random.default_rng(0).normal(0, 25, frame.left.shape)
     frame = replace(frame, left=np.clip(frame.left + noise, 0, 255).astype(np.uint8))
-    sources, sure = np.full(truth.shape, PixelOrigin.MEASURED, np.uint8), np.ones(truth.shape, np.float32)
-    prior = Disparity(frame.stamp, truth, sources, sure)
-    seen = np.arange(320) >= truth + 2
-
-    def bad(follow):
-        found = Match(disparities=64, prior_weight=0.1, follow_slopes=follow, **search)(frame, prior).pixels
-        return (~(np.abs(found - truth) <= 0.5))[seen].mean()
-
-    assert bad(True) < 0.8 * bad(False)
+    bad = {}
+    for follow in (True, False):
+        match = Match(disparities=64, prior_weight=0.1, follow_slopes=follow, **search)
+        right = np.abs(match(frame, disparity_of(truth, stamp=frame.stamp)).pixels - truth) <= 0.5
+        bad[follow] = (~right)[np.arange(320) >= truth + 2].mean()
+    assert bad[True] < 0.8 * bad[False]
 
 
-def test_disparities_are_not_drawn_to_whole_numbers(slope):
-    frame, truth = slope
-    error = Match(disparities=48)(frame).pixels - truth
-    part = (10 * (truth % 1)).astype(int)
+def test_disparities_are_not_drawn_to_whole_numbers():
+    error = Match(disparities=48)(SLOPE).pixels - TRUTH
+    part = (10 * (TRUTH % 1)).astype(int)
     bias = [np.nanmedian(error[(part == i) & (np.abs(error) < 1)]) for i in range(10)]
     assert np.abs(bias).max() < 0.06, bias
 
 
 @pytest.mark.parametrize("near", [False, True])
-def test_costs_are_kept_if_asked_for_and_change_nothing_else(slope, near):
-    frame, truth = slope
-    source, ones = np.full(truth.shape, PixelOrigin.MEASURED, np.uint8), np.ones(truth.shape, np.float32)
-    prior = Disparity(0, truth, source, ones) if near else None
+def test_costs_are_kept_if_asked_for_and_change_nothing_else(near):
+    prior = disparity_of(TRUTH) if near else None
     match = Match(disparities=48, search_radius=4 if near else 0)
-    plain, kept = match(frame, prior), replace(match, keep_costs=True)(frame, prior)
+    plain, kept = match(SLOPE, prior), replace(match, keep_costs=True)(SLOPE, prior)
     assert plain.costs is None
     assert kept.costs is not None
     assert same(plain, kept)
@@ -103,96 +78,82 @@ def test_costs_are_kept_if_asked_for_and_change_nothing_else(slope, near):
 
 
 @pytest.mark.parametrize("match", MATCHERS)
-def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(slope, match):
-    frame, truth = slope
-    pixels = match(frame).pixels
+def test_the_left_margin_is_matched_only_where_the_right_image_sees_it(match):
+    pixels = match(SLOPE).pixels
     assert not (pixels > np.arange(320)).any()
     margin = np.s_[:, :48]
-    visible, hidden = (np.arange(320) >= truth + 3)[margin], (np.arange(320) < truth - 3)[margin]
+    visible, hidden = (np.arange(320) >= TRUTH + 3)[margin], (np.arange(320) < TRUTH - 3)[margin]
     assert np.isfinite(pixels[margin])[visible].mean() > 0.9
     assert np.isfinite(pixels[margin])[hidden].mean() < 0.05
 
 
-def test_partners_outside_the_right_image_win_where_they_cost_little(slope):
-    frame, truth = slope
-    visible = (np.arange(320) >= truth + 3) & (np.arange(320) < 48)
-    cheap, dear = (Match(disparities=48, unseen_cost=cost)(frame).pixels[visible] for cost in (2, 59))
+def test_partners_outside_the_right_image_win_where_they_cost_little():
+    visible = (np.arange(320) >= TRUTH + 3) & (np.arange(320) < 48)
+    cheap, dear = (Match(disparities=48, unseen_cost=cost)(SLOPE).pixels[visible] for cost in (2, 59))
     assert np.isfinite(cheap).mean() < 0.5 < 0.9 < np.isfinite(dear).mean()
 
 
-def test_a_range_that_starts_elsewhere_finds_the_same(slope):
-    frame, truth = slope
-    inside = (truth > 14) & (truth < 30) & (np.arange(320) > 60)
+def test_a_range_that_starts_elsewhere_finds_the_same():
+    inside = (TRUTH > 14) & (TRUTH < 30) & (np.arange(320) > 60)
     for minimum, disparities in ((12, 50), (-20, 70)):
-        pixels = Match(disparities=disparities, min_disparity=minimum)(frame).pixels[inside]
-        known = np.isfinite(pixels)
-        assert known.mean() > 0.95
-        assert np.median(np.abs(pixels - truth[inside])[known]) < 0.12
+        found = Match(disparities=disparities, min_disparity=minimum)(SLOPE)
+        known, error, _ = accuracy(found.pixels, TRUTH, inside)
+        assert known > 0.95
+        assert error < 0.12
 
 
 @pytest.mark.parametrize(("match", "largest"), [*zip(MATCHERS, (0.12, 0.15), strict=True)])
-def test_a_negative_range_finds_points_beyond_infinity(slope, match, largest):
-    frame, truth = slope
-    crossed = frame_of(frame.left[:, ::-1].copy(), frame.right[:, ::-1].copy())
-    pixels = replace(match, min_disparity=-47)(crossed).pixels
-    known = np.isfinite(pixels)
-    assert known.mean() > 0.85
-    assert np.median(np.abs(pixels + truth[:, ::-1])[known]) < largest
+def test_a_negative_range_finds_points_beyond_infinity(match, largest):
+    crossed = frame_of(SLOPE.left[:, ::-1].copy(), SLOPE.right[:, ::-1].copy())
+    known, error, _ = accuracy(replace(match, min_disparity=-47)(crossed).pixels, -TRUTH[:, ::-1])
+    assert known > 0.85
+    assert error < largest
 
 
-def test_what_lies_beyond_max_depth_is_neither_searched_nor_made_up(slope):
-    frame, truth = slope
+def test_what_lies_beyond_max_depth_is_neither_searched_nor_made_up():
     match = Match(disparities=48, max_depth=1.5)  # 20 px: fx * baseline is 30 px m
-    coarse = np.where(np.arange(320) >= truth, truth, np.nan).astype(np.float32)
-    prior = Disparity(0, coarse, np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
-    whole, near = (Match(disparities=48)(frame, prior).pixels, match(frame, prior).pixels)
-    visible = np.arange(320) >= truth + 2
+    prior = disparity_of(np.where(np.arange(320) >= TRUTH, TRUTH, np.nan))
+    whole, result = Match(disparities=48)(SLOPE, prior).pixels, match(SLOPE, prior)
+    visible, near = np.arange(320) >= TRUTH + 2, result.pixels
     assert np.nanmin(near) >= 20
-    assert np.isnan(near[visible & (truth < 17)]).all()
-    within = visible & (truth > 20)
+    assert np.isnan(near[visible & (TRUTH < 17)]).all()
+    within = visible & (TRUTH > 20)
     assert np.isfinite(near[within]).mean() > 0.95
-    assert np.isfinite(near[visible & (truth > 20) & (truth < 21)]).mean() > 0.8
-    result = match(frame, prior)
-    assert not result.confidence[np.isnan(result.pixels)].any()
-    beyond = result.source[(truth < 18) & (np.arange(320) > 40)]
+    assert np.isfinite(near[within & (TRUTH < 21)]).mean() > 0.8
+    assert not result.confidence[np.isnan(near)].any()
+    beyond = result.source[(TRUTH < 18) & (np.arange(320) > 40)]
     assert (beyond == PixelOrigin.OUT_OF_RANGE).mean() > 0.5
     assert np.nanmedian(np.abs(near - whole)[within]) < 0.02
     # A camera whose principal points differ sees the same depth at another disparity.
-    moved = replace(frame, camera=replace(frame.camera, cx_right=frame.camera.cx + 5))
+    moved = replace(SLOPE, camera=replace(SLOPE.camera, cx_right=SLOPE.camera.cx + 5))
     assert 15 <= np.nanmin(match(moved).pixels) < 20
 
 
-def test_what_is_nearer_than_the_range_is_unknown_or_the_priors(slope):
-    frame, truth = slope
-    known = np.arange(320) >= truth + 2
-    prior = Disparity(
-        0, np.where(known, truth, np.nan).astype(np.float32), np.full(truth.shape, PixelOrigin.MEASURED, np.uint8),
-        np.full(truth.shape, 0.7, np.float32),
-    )  # fmt: skip
-    bare, joined = Match(disparities=24)(frame, prior), Match(disparities=24, out_of_range="prior")(frame, prior)
-    nearer = known & (truth > 22.5)
+def test_what_is_nearer_than_the_range_is_unknown_or_the_priors():
+    known = np.arange(320) >= TRUTH + 2
+    prior = disparity_of(np.where(known, TRUTH, np.nan), confidence=0.7)
+    bare, joined = Match(disparities=24)(SLOPE, prior), Match(disparities=24, out_of_range="prior")(SLOPE, prior)
+    nearer = known & (TRUTH > 22.5)
     assert nearer.sum() > 1000
-    assert (bare.source[known & (truth > 26.5)] == PixelOrigin.OUT_OF_RANGE).all()
-    np.testing.assert_array_equal(joined.pixels[known & (truth > 26.5)], prior.pixels[known & (truth > 26.5)])
+    assert (bare.source[known & (TRUTH > 26.5)] == PixelOrigin.OUT_OF_RANGE).all()
+    np.testing.assert_array_equal(joined.pixels[known & (TRUTH > 26.5)], prior.pixels[known & (TRUTH > 26.5)])
     assert np.isfinite(joined.pixels[nearer]).all()  # the end of the range, where the search also loses some
-    assert np.abs(joined.pixels - truth)[nearer].max() < 1
+    assert np.abs(joined.pixels - TRUTH)[nearer].max() < 1
     taken = nearer & np.isnan(bare.pixels)
     assert (joined.source[taken] == PixelOrigin.MEASURED).all()
     assert (joined.confidence[taken] == np.float32(0.7)).all()
-    np.testing.assert_array_equal(joined.pixels[~taken & (truth < 22)], bare.pixels[~taken & (truth < 22)])
-    guess = replace(prior, source=np.full(truth.shape, PixelOrigin.FILLED, np.uint8))  # is no measurement
-    assert np.nanmax(Match(disparities=24, out_of_range="prior")(frame, guess).pixels) < 24.5
+    np.testing.assert_array_equal(joined.pixels[~taken & (TRUTH < 22)], bare.pixels[~taken & (TRUTH < 22)])
+    guess = disparity_of(prior.pixels, PixelOrigin.FILLED)  # is no measurement
+    assert np.nanmax(Match(disparities=24, out_of_range="prior")(SLOPE, guess).pixels) < 24.5
 
 
 @pytest.mark.parametrize(("match", "border", "largest"), [*zip(MATCHERS, (2, 0), (0.12, 0.15), strict=True)])
-def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(slope, match, border, largest):
-    frame, truth = slope
-    deep = frame_of(frame.left.astype(np.uint16) * 9 + 700, frame.right.astype(np.uint16) * 9 + 700)
-    assert same(match(in_colour(frame)), match(frame))
-    pixels = match(deep).pixels
-    known = np.isfinite(pixels)
-    assert known[np.arange(320) >= truth + border].mean() > 0.95
-    assert np.median(np.abs(pixels - truth)[known]) < largest
+def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(match, border, largest):
+    deep = frame_of(SLOPE.left.astype(np.uint16) * 9 + 700, SLOPE.right.astype(np.uint16) * 9 + 700)
+    assert same(match(COLOURED), match(SLOPE))
+    known, error, _ = accuracy(match(deep).pixels, TRUTH, np.arange(320) >= TRUTH + border)
+    assert known > 0.95
+    assert error < largest
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
@@ -216,60 +177,56 @@ def test_any_size_and_range_gives_disparities_inside_both(h, w, paths, dispariti
     right = np.roll(left, -5, axis=1)
     match = Match(disparities=disparities, min_disparity=minimum, paths=paths)
     result = match(frame_of(left, right))
-    known = check_in_view(result, minimum, minimum + disparities - 1)
-    assert np.isin(result.source[~known], REASONS).all()
+    known = check_view(result, minimum, minimum + disparities - 1)
+
     assert (result.confidence[known] > 0).all()
     assert same(result, replace(match, threads=2)(frame_of(left, right)))
 
 
 @pytest.fixture
-def known(slope):
+def known():
     """What a slope's prior may say, no better than within 2 px, where both cameras see it."""
-    _, truth = slope
-    rough = truth + np.random.default_rng(4).uniform(-2, 2, truth.shape).astype(np.float32)
-    rough[:, :50][truth[:, :50] > np.arange(50) - 3] = np.nan
-    return Disparity(0, rough, np.full(truth.shape, PixelOrigin.FILLED, np.uint8), np.ones(truth.shape, np.float32))
+    rough = TRUTH + np.random.default_rng(4).uniform(-2, 2, TRUTH.shape).astype(np.float32)
+    rough[:, :50][TRUTH[:, :50] > np.arange(50) - 3] = np.nan
+    return disparity_of(rough, PixelOrigin.FILLED)
 
 
 @pytest.mark.parametrize("paths", [4, 8])
-def test_near_a_prior_disparities_are_found_also_beyond_the_range(slope, known, paths):
-    frame, truth = slope
+def test_near_a_prior_disparities_are_found_also_beyond_the_range(known, paths):
     near = Match(disparities=10, search_radius=4, paths=paths, prior_weight=0.0)
-    found = near(frame, known)
+    found = near(SLOPE, known)
     guided = np.isfinite(known.pixels)
     assert np.isnan(found.pixels[~guided]).all()
-    assert np.isfinite(found.pixels[guided]).mean() > 0.9
-    error = np.abs(found.pixels - truth)[np.isfinite(found.pixels)]
-    assert np.median(error) < 0.11
-    assert (error > 1).mean() < 0.01
-    assert same(found, replace(near, threads=2)(frame, known))
-    assert same(found, replace(near, disparities=48, out_of_range="prior")(frame, known))
+    share, error, wrong = accuracy(found.pixels, TRUTH, guided)
+    assert share > 0.9
+    assert error < 0.11
+    assert wrong < 0.01
+    assert same(found, replace(near, threads=2)(SLOPE, known))
+    assert same(found, replace(near, disparities=48, out_of_range="prior")(SLOPE, known))
 
 
-def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(slope, known):
-    frame, truth = slope
-    pixels = Match(search_radius=4, max_depth=1.5)(frame, known).pixels  # 20 px
+def test_around_a_prior_nothing_is_found_beyond_the_farthest_of_interest(known):
+    pixels = Match(search_radius=4, max_depth=1.5)(SLOPE, known).pixels  # 20 px
     assert np.nanmin(pixels) >= 20
-    assert np.isnan(pixels[truth < 15]).all()
-    assert np.isfinite(pixels)[(truth > 24) & np.isfinite(known.pixels)].mean() > 0.95
+    assert np.isnan(pixels[TRUTH < 15]).all()
+    assert np.isfinite(pixels)[(TRUTH > 24) & np.isfinite(known.pixels)].mean() > 0.95
 
 
-def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company(slope):
-    frame, _ = slope
+def test_the_bits_depend_neither_on_threads_nor_on_memory_nor_on_company():
     match = Match(disparities=48)
-    alone = match(frame)
+    alone = match(SLOPE)
     with ThreadPoolExecutor(3) as workers:
-        others = list(workers.map(lambda stage: stage(frame), [replace(match, threads=t) for t in (1, 2, 3, 2)]))
+        others = list(workers.map(lambda stage: stage(SLOPE), [replace(match, threads=t) for t in (1, 2, 3, 2)]))
     # 200 rows of 320 * 64 bytes are 4 MB: stripes of 25 rows
-    others += [replace(match, max_memory=1, threads=threads)(frame) for threads in (1, 2)]
+    others += [replace(match, max_memory=1, threads=threads)(SLOPE) for threads in (1, 2)]
     assert all(same(other, alone) for other in others)
 
 
 def test_turning_the_images_upside_down_turns_the_result():
-    frame, _ = slanted_pair(height=97, width=150)
-    result = Match(disparities=40)(frame)
+    frame, _ = slanted(height=97, width=150)
     turned = Match(disparities=40)(frame_of(frame.left[::-1].copy(), frame.right[::-1].copy()))
-    assert same(result, replace(turned, **{name: getattr(turned, name)[::-1] for name in LAYERS}))
+    upright = {name: getattr(turned, name)[::-1] for name in ("pixels", "source", "confidence")}
+    assert same(Match(disparities=40)(frame), replace(turned, **upright))
 
 
 def test_a_prior_decides_where_the_images_do_not():
@@ -277,9 +234,7 @@ def test_a_prior_decides_where_the_images_do_not():
     image = np.tile(stripes, (80, 1))
     image = np.clip(image + textured(80, 320, 3) / 12 - 10, 0, 255).astype(np.uint8)
     frame = frame_of(image, np.roll(image, -16, axis=1))
-    wanted = np.full((80, 320), 16, np.float32)
-    prior = Disparity(0, wanted, np.ones((80, 320), np.uint8), np.ones((80, 320), np.float32))
-    unknown = replace(prior, pixels=np.full_like(wanted, np.nan))
+    prior, unknown = (disparity_of(np.full((80, 320), value), PixelOrigin.MEASURED, 1) for value in (16, np.nan))
     plain, guided = Match(disparities=48)(frame), Match(disparities=48, prior_weight=4.0)(frame, prior)
     assert same(Match(disparities=48, prior_weight=4.0)(frame, unknown), plain)
     inner = np.s_[:, 60:300]
@@ -289,11 +244,9 @@ def test_a_prior_decides_where_the_images_do_not():
     assert guided.confidence[inner].mean() > plain.confidence[inner].mean()
 
 
-def test_a_wrong_prior_does_not_overrule_the_images(slope):
-    frame, truth = slope
-    wrong = Disparity(0, truth + np.float32(5), np.ones(truth.shape, np.uint8), np.ones(truth.shape, np.float32))
-    pixels = Match(disparities=48)(frame, wrong).pixels
-    assert np.nanmedian(np.abs(pixels - truth)) < 0.15
+def test_a_wrong_prior_does_not_overrule_the_images():
+    pixels = Match(disparities=48)(SLOPE, disparity_of(TRUTH + 5)).pixels
+    assert np.nanmedian(np.abs(pixels - TRUTH)) < 0.15
 
 
 @pytest.mark.slow
@@ -301,13 +254,10 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
     simulation = Simulation(scene="gravel", frames=3, width=480, height=360)
     parts = []
     for index in range(simulation.frames):
-        made = simulation.frame(index)
-        stamp = simulation.stamp(index)
-        truth = true_disparity(simulation, stamp, made).pixels
-        frame = StereoFrame(stamp, *made.images, simulation.camera)
-        result = Match(disparities=96)(frame)
-        known = np.isfinite(result.pixels) & np.isfinite(truth)
-        parts.append((result.confidence[known], np.abs(result.pixels - truth)[known] <= 1))
+        made, stamp = simulation.frame(index), simulation.stamp(index)
+        result = Match(disparities=96)(StereoFrame(stamp, *made.images, simulation.camera))
+        error = np.abs(result.pixels - true_disparity(simulation, stamp, made).pixels)
+        parts.append((result.confidence[np.isfinite(error)], error[np.isfinite(error)] <= 1))
     confidence, right = map(np.concatenate, zip(*parts, strict=True))
     assert len(right) > 200_000
     assert right.mean() == pytest.approx(confidence.mean(), abs=0.05)
@@ -316,66 +266,56 @@ def test_the_confidence_is_the_share_of_right_matches_on_simulated_terrain():
 
 
 @pytest.mark.parametrize(
-    ("parameters", "message"),
+    ("kind", "parameters", "message"),
     [
-        ({"p1": 100, "p2": 30}, "p2 must be above"),
-        ({"p2": 220}, "p2 must be at most 196"),
-        ({"paths": 5}, "must be one of 4, 8"),
-        ({"max_depth": "12m"}, "max_depth must be a number in m, not '12m'"),
+        (Match, {"p1": 100, "p2": 30}, "p2 must be above"),
+        (Match, {"p2": 220}, "p2 must be at most 196"),
+        (Match, {"paths": 5}, "must be one of 4, 8"),
+        (Match, {"max_depth": "12m"}, "max_depth must be a number in m, not '12m'"),
+        (Match, {"band_height": 16, "search_radius": 4}, r"band_height has no effect with Match.search_radius"),
+        (MatchOpenCV, {"block_size": 4}, "block_size must be odd"),
+        (MatchOpenCV, {"p1": 30.0}, "p2 must be above"),
+        (MatchOpenCV, {"paths": 4}, "must be one of 3, 5, 8"),
+        (MatchOpenCV, {"block_size": 9, "color": True}, "16 bits"),
     ],
 )
-def test_parameters_that_cannot_work_are_refused(parameters, message):
+def test_parameters_that_cannot_work_are_refused(kind, parameters, message):
     with pytest.raises(ValueError, match=message):
-        Match(**parameters)
+        kind(**parameters)
 
 
-def test_frames_that_cannot_be_matched_are_refused(slope):
-    frame, truth = slope
-    image = np.zeros((15, 64), np.uint8)
-    with pytest.raises(ValueError, match="64x15"):
-        Match()(frame_of(image, image))
-    with pytest.raises(ValueError, match="320 px wide"):
-        Match(min_disparity=400)(frame)
-    with pytest.raises(ValueError, match=r"max_depth = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"):
-        Match(disparities=48, max_depth=0.5)(frame)
-    small = Disparity(0, truth[:50], np.ones((50, 320), np.uint8), np.ones((50, 320), np.float32))
-    with pytest.raises(ValueError, match=r"search_radius = 4 px needs a `prior`"):
-        Match(search_radius=4)(frame)
-    with pytest.raises(ValueError, match=r"follow_slopes needs a `prior`"):
-        Match(follow_slopes=True)(frame)
-    with pytest.raises(ValueError, match=r"prior must be a stages\.Disparity, not a ndarray"):
-        Match()(frame, truth)
-    with pytest.raises(ValueError, match=r"prior has shape \(50, 320\)"):
-        Match()(frame, small)
+@pytest.mark.parametrize(("match", "inputs", "message"), [
+    (Match(), (frame_of(*np.zeros((2, 15, 64), np.uint8)),), "64x15"),
+    (MatchOpenCV(), (frame_of(*np.zeros((2, 20, 64), np.uint8)),), "64x20"),
+    (Match(min_disparity=400), (SLOPE,), "320 px wide"),
+    (Match(disparities=48, max_depth=0.5), (SLOPE,),
+     "max_depth = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"),
+    (Match(search_radius=4), (SLOPE,), "search_radius = 4 px needs a `prior`"),
+    (Match(band_height=16), (SLOPE,), r"Match\.band_height = 16 px needs a `prior`"),
+    (Match(follow_slopes=True), (SLOPE,), "follow_slopes needs a `prior`"),
+    (Match(), (SLOPE, TRUTH), r"prior must be a stages\.Disparity, not a ndarray"),
+    (Match(), (SLOPE, disparity_of(TRUTH[:50])), r"prior has shape \(50, 320\)"),
+])  # fmt: skip
+def test_frames_that_cannot_be_matched_are_refused(match, inputs, message):
+    with pytest.raises(ValueError, match=message):
+        match(*inputs)
 
 
 FEATURES = {
     "nehalem": "+sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+popcnt,+cx16",
     "haswell": "+sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+popcnt,+cx16,+avx,+avx2,+bmi,+bmi2,+fma,+lzcnt,+movbe,+f16c",
 }
-DIGEST = """
-import hashlib, sys
-sys.path.insert(0, {root!r})
-from stages import Match
-from tests.stages.matching.pairs import slanted_pair
-frame, _ = slanted_pair(height=64, width=100)
-results = [Match(disparities=40)(frame)]
-results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
-print(hashlib.sha256(b"".join(result.pixels.tobytes() for result in results)).hexdigest())
-"""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("processor", ["haswell", "nehalem"])
 def test_processors_without_avx512_give_the_same_bits(processor):
-    frame, _ = slanted_pair(height=64, width=100)
-    results = [Match(disparities=40)(frame)]
-    results += [Match(search_radius=4)(frame, results[0]), Match(disparities=128, band_height=32)(frame, results[0])]
-    expected = b"".join(result.pixels.tobytes() for result in results)
-    command = [sys.executable, "-c", DIGEST.format(root=str(ROOT))]
+    command = [sys.executable, "-c", "from tests.stages.matching.pairs import digest; print(digest())"]
     environment = {**os.environ, "NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": FEATURES[processor]}
-    output = subprocess.check_output(command, env=environment, stderr=subprocess.DEVNULL, text=True)
-    assert output.strip() == hashlib.sha256(expected).hexdigest()
+    output = subprocess.check_output(
+        command, cwd=Path(__file__).parents[3], env=environment, stderr=subprocess.DEVNULL, text=True
+    )
+    assert output.strip() == digest()
 
 
 def test_real_scenes_are_matched_better_than_by_opencv():
@@ -400,14 +340,12 @@ def test_real_scenes_are_matched_better_than_by_opencv():
 @pytest.mark.parametrize("threads", [1, 2])
 @pytest.mark.parametrize("height", [24, 25, 26, 27])  # a stripe: 12 rows of 640 * 64 bytes: one half, both, none
 def test_stripes_give_the_same_bits_when_the_halves_differ(height, threads):
-    frame, _ = slanted_pair(height=height, width=640)
+    frame, _ = slanted(height=height, width=640)
     whole, stripes = (Match(disparities=64, max_memory=memory, threads=threads)(frame) for memory in (400, 1))
     assert same(stripes, whole)
 
 
 def test_a_frame_larger_than_the_memory_is_matched_in_stripes():
-    frame, truth = slanted_pair(height=256, width=1024, near=500.0, far=450.0)
-    result = Match(disparities=512, max_memory=20)(StereoFrame(0, frame.left, frame.right, frame.camera))
-    visible = np.arange(1024) >= truth + 2
-    error = np.abs(result.pixels - truth)[visible]
-    assert (error <= 1).mean() > 0.9
+    frame, truth = slanted(height=256, width=1024, near=500.0, far=450.0)
+    error = np.abs(Match(disparities=512, max_memory=20)(frame).pixels - truth)
+    assert (error[np.arange(1024) >= truth + 2] <= 1).mean() > 0.9

@@ -5,28 +5,24 @@ import pytest
 
 from flow.contracts import Severity
 from recordings.simulator import Simulation
-from stages import CheckMatches, Disparity, PixelOrigin, StereoFrame
+from stages import CheckMatches, PixelOrigin, StereoFrame
 from tests.bench.refining import stereo_part
 from tests.conftest import slow
+from tests.stages.builders import disparity_of
 from tests.stages.running import Running
 
 
-def disparity_with(matched: np.ndarray) -> Disparity:
-    source = np.where(matched, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.FILLED))
-    return Disparity(0, np.ones(matched.shape, np.float32), source, np.ones(matched.shape, np.float32))
-
-
 def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
-    sky, ground = np.ones((80, 100), bool), np.ones((80, 100), bool)
-    sky[:60] = False
-    ground[68:] = False
+    matched = np.full((2, 80, 100), PixelOrigin.MEASURED)
+    matched[0, :60] = matched[1, 68:] = PixelOrigin.FILLED
+    sky, ground = (disparity_of(np.ones(part.shape), part) for part in matched)
     check = Running(CheckMatches())
-    assert check(disparity_with(sky)).near == check(disparity_with(sky)).near == 1
-    health = check(disparity_with(ground))
+    assert check(sky).near == check(sky).near == 1
+    health = check(ground)
     assert (health.all, health.near) == (0.85, 0)
     assert check.finding() is None
-    check(disparity_with(ground))
-    check(disparity_with(ground))
+    check(ground)
+    check(ground)
     found = check.finding()
     assert found.severity == Severity.WARNING
     assert "Only 0 % of the nearest ground is matched" in found.sentence

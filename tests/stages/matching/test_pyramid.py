@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages import Disparity, Halve, LeftRightCheck, Match, PixelOrigin, StereoCamera, StereoFrame, SwapViews, Upsample
+from stages import Halve, LeftRightCheck, Match, PixelOrigin, StereoCamera, StereoFrame, SwapViews, Upsample
 from stages.matching.kernels.lr_check import drop_inconsistent, drop_inconsistent_reference
 from stages.matching.kernels.resample import doubled, doubled_reference, halved
+from tests.stages.builders import disparity_of
+from tests.stages.matching.pairs import frame_of
 
 
 def slope_frame(height=97, width=131):
@@ -46,8 +48,8 @@ def test_enlarging_doubles_disparities_between_pixels_of_one_surface_only():
     pixels = ((8 + 0.1 * (2 * y + 0.5)) / 2).astype(np.float32)
     pixels[:, 40:] += 20
     pixels[10:20, 10:20] = np.nan
-    source = np.where(np.isnan(pixels), PixelOrigin.SPECKLE, PixelOrigin.PLANE).astype(np.uint8)
-    large = Upsample()(frame, Disparity(7, pixels, source, np.full(pixels.shape, 0.7, np.float32)))
+    source = np.where(np.isnan(pixels), PixelOrigin.SPECKLE, PixelOrigin.PLANE)
+    large = Upsample()(frame, disparity_of(pixels, source, stamp=7))
     assert large.pixels.shape == truth.shape
     known = np.isfinite(large.pixels)
     assert not known[20:40, 20:40].any()
@@ -79,21 +81,18 @@ def test_contradictions_equal_the_reference(height, width, tolerance, seed):
     sources, worth = rng.integers(0, 11, maps.shape, np.uint8), rng.random(maps.shape).astype(np.float32)
     found, backward = zip(maps, sources, worth, strict=True)
     for largest in (np.inf, 5.0):
-        left = drop_inconsistent(found, backward, tolerance, largest)
-        for ours, plain in zip(left, drop_inconsistent_reference(found, backward, tolerance, largest), strict=True):
-            np.testing.assert_array_equal(ours, plain)
+        given = found, backward, tolerance, largest
+        np.testing.assert_equal(drop_inconsistent(*given), drop_inconsistent_reference(*given))
 
 
 def test_what_the_right_image_sees_otherwise_is_unknown():
-    pixels = np.full((2, 40), 5, np.float32)
     backward = np.full((2, 40), 5, np.float32)  # mirrored: left pixel x asks right pixel x - 5, at 39 - (x - 5)
-    backward[0, 39 - (20 - 5)] = 9
-    backward[1, 39 - (20 - 5)] = np.nan
-    given = Disparity(1, pixels, np.ones((2, 40), np.uint8), np.full((2, 40), 0.9, np.float32))
-    checked = LeftRightCheck()(given, Disparity(1, backward, given.source, given.confidence))
+    backward[:, 39 - (20 - 5)] = 9, np.nan
+    given = disparity_of(np.full((2, 40), 5)), disparity_of(backward, PixelOrigin.MEASURED, 0.9)
+    checked = LeftRightCheck()(*given)
     assert np.argwhere(np.isnan(checked.pixels)).tolist() == [[0, 20]]
     assert (checked.source[0, 20], checked.confidence[0, 20]) == (PixelOrigin.LEFT_RIGHT, 0)
-    beyond = LeftRightCheck(disparities=4)(given, Disparity(1, backward, given.source, given.confidence))
+    beyond = LeftRightCheck(disparities=4)(*given)
     assert np.isfinite(beyond.pixels).all()  # 5 px was not searched for from the right
 
 
@@ -106,13 +105,10 @@ def test_half_an_image_is_the_mean_of_four_and_repeats_an_odd_border():
 
 
 def test_a_frame_too_small_to_halve_names_its_own_size_and_the_way_out():
-    whole = np.zeros((30, 80), np.uint8)
-    frame = StereoFrame(7, whole, whole, StereoCamera(200, 200, 40, 15, 0.2, 80, 30))
+    small, enough = (frame_of(*np.zeros((2, rows, 80), np.uint8)) for rows in (30, 31))
     with pytest.raises(ValueError, match=r"Halve: images are 80x30, .* at least 31 px; .* such as paper"):
-        Halve()(frame)
-    enough = np.zeros((31, 80), np.uint8)
-    half = Halve()(StereoFrame(7, enough, enough, StereoCamera(200, 200, 40, 15, 0.2, 80, 31)))
-    assert Match(disparities=8)(half).pixels.shape == (16, 40)
+        Halve()(small)
+    assert Match(disparities=8)(Halve()(enough)).pixels.shape == (16, 40)
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.booleans(), st.booleans(), st.integers(0, 99))

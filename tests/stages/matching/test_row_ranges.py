@@ -1,6 +1,7 @@
 """Ranges of bands of rows: they hold what the prior has; the search in them is, bit for bit, that of the reference."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,28 +9,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stages.compiled.simd import Width
-from stages.data import Disparity, PixelOrigin
+from stages.data import PixelOrigin
+from stages.matching.kernels import row_ranges as module
 from stages.matching.kernels.aggregation import aggregate_reference
 from stages.matching.kernels.gradient import smoothed_costs_reference
 from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
-from stages.matching.kernels.row_ranges import (
-    MIN_KNOWN_SHARE,
-    NARROW_LANES,
-    RANGE_MARGIN,
-    Range,
-    by_range,
-    lanes_for,
-    move_paths,
-    row_ranges,
-)
+from stages.matching.kernels.row_ranges import Range, by_range, lanes_for, move_paths, row_ranges
 from stages.matching.kernels.selection import costs_reference, select_reference
 from stages.matching.kernels.semiglobal import match
 from stages.matching.kernels.texture import contrast, drop_unmatchable_reference
 from stages.matching.match import Match
-from tests.stages.matching.pairs import slanted_pair
+from tests.stages.builders import disparity_of
+from tests.stages.matching.pairs import SLOPE, TRUTH, same
 from tests.stages.matching.test_census import params_of
-from tests.stages.matching.test_match import same
 from tests.stages.matching.test_sgm_local import views
 
 
@@ -53,12 +46,12 @@ def test_every_row_is_in_one_band_whose_range_holds_its_prior(rows, columns, ban
             continue
         assert each.first >= 0
         assert each.first + each.width.lanes <= disparities
-        assert each.width.lanes in NARROW_LANES
+        assert each.width.lanes in module.NARROW_LANES
         inside = prior[each.top : each.end]
         known = np.clip(inside[np.isfinite(inside)], minimum, minimum + disparities - 1)
-        if known.size >= MIN_KNOWN_SHARE * inside.size:
-            assert first <= max(known.min() - RANGE_MARGIN + 1, minimum)
-            assert last >= min(known.max() + RANGE_MARGIN - 1, minimum + disparities - 1)
+        if known.size >= module.MIN_KNOWN_SHARE * inside.size:
+            assert first <= max(known.min() - module.RANGE_MARGIN + 1, minimum)
+            assert last >= min(known.max() + module.RANGE_MARGIN - 1, minimum + disparities - 1)
     assert found == row_ranges(prior, band, minimum, disparities, threads=2)
 
 
@@ -115,7 +108,7 @@ def test_disparities_are_those_of_a_search_without_the_rest_of_the_range(diagona
     cuts = [0, *sorted(rng.choice(range(1, height), 3, replace=False).tolist()), height]
     ranges = []
     for top, end in itertools.pairwise(cuts):
-        lanes = int(rng.choice([n for n in (*NARROW_LANES, whole) if n < disparities or n == whole]))
+        lanes = int(rng.choice([n for n in (*module.NARROW_LANES, whole) if n < disparities or n == whole]))
         first = 0 if lanes == whole else int(rng.integers(0, disparities - lanes + 1))
         ranges.append(Range(top, end, first, Width(lanes)))
     table = np.round(12 + 90 / (1 + np.arange(256) / 10)).astype(np.uint8)
@@ -124,7 +117,6 @@ def test_disparities_are_those_of_a_search_without_the_rest_of_the_range(diagona
     )
     first = np.concatenate([np.full((each.end - each.top, 1), minimum + each.first) for each in ranges])
     guide = prior_costs(prior, first, whole, 0.5, 4.0)
-    found = match(left, right, params, guide, ranges, None, 1, 1 << 30)
 
     inputs = matching_inputs(left, right, params, Width(whole))
     planes = matching_inputs(right, right, params, Width(whole)).left[:, :, :columns]
@@ -145,54 +137,29 @@ def test_disparities_are_those_of_a_search_without_the_rest_of_the_range(diagona
             kept[:, y] = costs_reference(total[y])
     contrasts = (contrast(image, 0, len(image)) for image in (left, right))
     drop_unmatchable_reference(*contrasts, np.empty((0, 0), np.uint8), pixels, evidence, source)
-    np.testing.assert_array_equal(found.pixels, pixels)
-    np.testing.assert_array_equal(found.source, source)
-    np.testing.assert_array_equal(found.confidence, params.confidence_of[evidence])
-    np.testing.assert_array_equal(found.costs, kept)
-    for threads, memory in ((2, 1 << 30), (1, 1), (2, 1)):
-        again = match(left, right, params, guide, ranges, None, threads, memory)
-        np.testing.assert_array_equal(again.pixels, found.pixels)
-        np.testing.assert_array_equal(again.source, found.source)
-        np.testing.assert_array_equal(again.confidence, found.confidence)
-        np.testing.assert_array_equal(again.costs, found.costs)
-
-
-@pytest.fixture(scope="module")
-def slope():
-    return slanted_pair()
-
-
-def known(truth, source=PixelOrigin.FILLED):
-    return Disparity(0, truth, np.full(truth.shape, source, np.uint8), np.ones(truth.shape, np.float32))
+    for threads, memory in ((1, 1 << 30), (2, 1 << 30), (1, 1), (2, 1)):
+        found = match(left, right, params, guide, ranges, None, threads, memory)
+        np.testing.assert_array_equal(found.pixels, pixels)
+        np.testing.assert_array_equal(found.source, source)
+        np.testing.assert_array_equal(found.confidence, params.confidence_of[evidence])
+        np.testing.assert_array_equal(found.costs, kept)
 
 
 @pytest.mark.parametrize("paths", [4, 8])
-def test_bands_find_what_the_whole_range_finds(slope, paths):
-    frame, truth = slope
-    whole = Match(disparities=192, paths=paths)
-    bands = Match(disparities=192, paths=paths, band_height=16)
-    one, other = whole(frame, known(truth)), bands(frame, known(truth))
-    visible = np.arange(320) >= truth + 2
+def test_bands_find_what_the_whole_range_finds(paths):
+    whole, prior = Match(disparities=192, paths=paths), disparity_of(TRUTH, PixelOrigin.FILLED)
+    bands = replace(whole, band_height=16)
+    one, other = whole(SLOPE, prior), bands(SLOPE, prior)
+    visible = np.arange(320) >= TRUTH + 2
     either = np.isfinite(one.pixels) | np.isfinite(other.pixels)
     assert (np.abs(one.pixels - other.pixels) < 0.3)[visible & either].mean() > 0.98
-    others = [
-        Match(disparities=192, paths=paths, band_height=16, threads=t, max_memory=m)
-        for t, m in ((2, 400), (1, 1), (2, 1))
-    ]
-    assert all(same(each(frame, known(truth)), other) for each in others)
+    for threads, memory in ((2, 400), (1, 1), (2, 1)):
+        assert same(replace(bands, threads=threads, max_memory=memory)(SLOPE, prior), other)
 
 
-def test_a_match_that_the_prior_has_outside_its_bands_range_is_unknown(slope):
-    frame, truth = slope
-    moved = truth.copy()
+def test_a_match_that_the_prior_has_outside_its_bands_range_is_unknown():
+    moved = TRUTH.copy()
     moved[40, 100:115] = 150  # 15 of 64 rows of 320 pixels: a speck
-    found = Match(disparities=192, band_height=64)(frame, known(moved, PixelOrigin.MEASURED))
+    found = Match(disparities=192, band_height=64)(SLOPE, disparity_of(moved))
     assert np.isnan(found.pixels[40, 100:115]).all()
     assert np.isfinite(found.pixels[41, 100:115]).all()
-
-
-def test_bands_need_a_prior(slope):
-    with pytest.raises(ValueError, match=r"Match.band_height = 16 px needs a `prior`"):
-        Match(band_height=16)(slope[0])
-    with pytest.raises(ValueError, match=r"band_height has no effect with Match.search_radius"):
-        Match(band_height=16, search_radius=4)
