@@ -1,17 +1,15 @@
 """Stages: `help()` shows the meaning of every parameter, and inputs that do not belong together are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
 import stages
 from flow.config.reference import stage_reference
-from stages import CameraModel, Disparity, StereoCamera, StereoFrame
+from stages import CameraModel, StereoCamera, StereoFrame
 from stages.stage import Stage
+from tests.stages.builders import cloud_of, disparity_of
 from tests.stages.running import Running
 
 NAMED = {name: getattr(stages, name) for name in dir(stages)}
@@ -19,15 +17,14 @@ KINDS = {name: kind for name, kind in NAMED.items() if isinstance(kind, type) an
 
 
 @pytest.mark.parametrize("name", sorted(KINDS))
-def test_help_shows_the_meaning_of_every_parameter(name: str) -> None:
+def test_help_shows_the_meaning_of_every_parameter(name):
     (found,) = stage_reference(name)
     text = KINDS[name].__doc__
     assert text.count("\nParameters\n----------\n") == bool(found.parameters)
     for item in found.parameters:
         unit = f" : {item.unit}" if item.unit else ""
-        assert (
-            f"\n{item.name}{unit}\n    {item.meaning}" in text or "." in item.name
-        )  # those of a value such as the rover stand in its own help
+        inside = "." in item.name  # of a value such as the rover, which has its own help
+        assert inside or f"\n{item.name}{unit}\n    {item.meaning}" in text
 
 
 IMAGE = np.zeros((60, 80), np.uint8)
@@ -36,8 +33,8 @@ FRAME = StereoFrame(7, IMAGE, IMAGE, StereoCamera(200, 200, 40, 30, 0.2, 80, 60)
 RAW = replace(FRAME, camera=replace(FRAME.camera, raw=(MODEL, MODEL)))
 
 
-def disparity(height: int = 60, width: int = 80, stamp: int = 7) -> Disparity:
-    return Disparity(stamp, *(np.ones((height, width), kind) for kind in (np.float32, np.uint8, np.float32)))
+def disparity(height=60, width=80, stamp=7):
+    return disparity_of(np.ones((height, width)), stamp=stamp)
 
 
 OF_FRAME_AND_DISPARITY = stages.Refine(), stages.RefinePaper(), stages.Reproject()
@@ -51,6 +48,8 @@ TIMES = "frame of 7 ns, disparity of 8 ns: join data"
       for stage in OF_FRAME_AND_DISPARITY),
     *((stage, (RAW, disparity()), rf"put stages\.Rectify before stages\.{type(stage).__name__}")
       for stage in OF_FRAME_AND_DISPARITY),
+    *((stage, (cloud_of(np.zeros((0, 3)), frame_id="cam"),), f"{type(stage).__name__}: .* 'cam', not 'level'; put")
+      for stage in (stages.Voxelise(), stages.VoxelGrid())),
     (stages.Match(), (IMAGE, IMAGE), f"Match: {NO_FRAME} ndarray"),
     (stages.Refine(), (disparity(), FRAME), f"Refine: {NO_FRAME} Disparity"),
     *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_FRAME_AND_DISPARITY[:2]),
@@ -61,6 +60,6 @@ TIMES = "frame of 7 ns, disparity of 8 ns: join data"
     (stages.LeftRightCheck(), (disparity(), disparity(stamp=8)),
      "LeftRightCheck: disparity of 7 ns, backward of 8 ns: join data"),
 ])  # fmt: skip
-def test_inputs_that_do_not_belong_together_are_refused(stage: Any, inputs: tuple[Any, ...], message: str) -> None:
+def test_inputs_that_do_not_belong_together_are_refused(stage, inputs, message):
     with pytest.raises(ValueError, match=message):
         stage(*inputs)

@@ -1,13 +1,12 @@
 """A drive over ground of known height, as clouds and poses for the regional map."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages import ElevationMap, FuseRegion, MapRegion, Mount, PointCloud, Pose, Region, Transform
+from stages import ElevationMap, Fuse, FuseRegion, MapRegion, Mount, Pose, Region, Transform
+from tests.stages.builders import cloud_of
 from tests.stages.running import Running
 
 SECOND = 1_000_000_000
@@ -53,13 +52,15 @@ def drive(frame, ground=rolling, sigma=0.02, tilt=(0.0, 0.0), at=None, noise=0.0
     heights = ground(world[:, 0], world[:, 1]) - base[2] + ahead @ tilt + noise * rng.normal(size=len(ahead))
     wrong = Rotation.from_rotvec([tilt[1], -tilt[0], 0.0]).as_matrix()
     sensor = replace(MOUNT.base_from_camera, parent="level", rotation=wrong @ LOOKING)
-    count = len(ahead)
-    cloud = PointCloud(
-        START + frame * SECOND, np.column_stack([ahead, heights]).astype(np.float32),
-        np.zeros((count, 3), np.uint8), np.full(count, sigma, np.float32), np.arange(count, dtype=np.int32), "level",
-        sensor=sensor,
-    )  # fmt: skip
+    cloud = cloud_of(np.column_stack([ahead, heights]), sigma, stamp=START + frame * SECOND, sensor=sensor)
     return cloud, Pose(cloud.stamp, base, Rotation.from_euler("z", yaw).as_quat(), "odom", "base_link")
+
+
+def fused(frames, **parameters):
+    """`Fuse` after these frames, and its last map."""
+    fuse = Running(Fuse(**parameters))
+    *_, terrain = (fuse(cloud, pose, MOUNT) for cloud, pose in frames)
+    return fuse, terrain
 
 
 def cell(terrain, x, y, layer="elevation"):

@@ -1,53 +1,47 @@
 """Scenes with ground truth for the terrain tests: a plane with rocks in a camera's view, and terrain grids."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import Array, Disparity, ElevationMap, PixelOrigin, StereoCamera, StereoFrame
+from stages.data import Array, Disparity, ElevationMap, StereoCamera, StereoFrame, Tilt
+from tests.stages.builders import disparity_of
 
 # The Devon Island camera at half size.
 CAMERA = StereoCamera(484.5, 484.5, 317.3, 231.5, 0.24, 640, 480)
 HEIGHT, PITCH = 1.0, np.deg2rad(15.0)
 UP = np.array([0.0, -np.cos(PITCH), -np.sin(PITCH)])
+TILT = Tilt(7, UP, CAMERA.frame_id)
 # Middle (x, y) and radius of spheres half sunk into the ground, m, in the level frame below the camera.
 ROCKS = ((3.0, 0.4, 0.3), (4.5, -0.8, 0.4), (6.0, 0.9, 0.3), (2.5, -0.5, 0.2))
 
 
-def level_from_camera() -> Array:
-    """Rotation: the camera looks along level x, PITCH below the horizon."""
-    x = np.array([0, -np.sin(PITCH), np.cos(PITCH)])
-    return np.stack([x, np.cross(UP, x), UP])
+_AHEAD = np.array([0, -np.sin(PITCH), np.cos(PITCH)])
+LEVEL_FROM_CAMERA = np.stack([_AHEAD, np.cross(UP, _AHEAD), UP])  # the camera looks along level x, PITCH below it
+_V, _U = np.mgrid[: CAMERA.height, : CAMERA.width]
+_RAYS = np.stack([(_U - CAMERA.cx) / CAMERA.fx, (_V - CAMERA.cy) / CAMERA.fy, np.ones(_U.shape)], axis=-1)
+RAYS = _RAYS @ LEVEL_FROM_CAMERA.T
 
 
-def seen_disparity(rocks: tuple[tuple[float, float, float], ...] = ROCKS, camera: StereoCamera = CAMERA) -> Array:
+def rocks_seen(rocks: tuple[tuple[float, float, float], ...] = ROCKS) -> Array:
     """Exact disparity (H, W) float64 of the plane z = 0 with rocks; NaN where no ray meets it."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    rays = rays @ level_from_camera().T
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.where(rays[..., 2] < 0, -HEIGHT / rays[..., 2], np.nan)
+        depth = np.where(RAYS[..., 2] < 0, -HEIGHT / RAYS[..., 2], np.nan)
         for x, y, radius in rocks:
             middle = np.array([x, y, -HEIGHT])
-            a, b, c = (rays**2).sum(-1), rays @ middle, middle @ middle - radius**2
-            hit = (b - np.sqrt(b * b - a * c)) / a
-            depth = np.fmin(depth, hit)
-        return camera.fx * camera.baseline / depth
+            a, b, c = (RAYS**2).sum(-1), RAYS @ middle, middle @ middle - radius**2
+            depth = np.fmin(depth, (b - np.sqrt(b * b - a * c)) / a)
+        return CAMERA.fx * CAMERA.baseline / depth
 
 
-def profile_disparity(profile: Callable[[Array], Array], camera: StereoCamera = CAMERA) -> Array:
+def profile_seen(profile: Callable[[Array], Array]) -> Array:
     """Exact disparity (H, W) float64 of ground with this height profile ahead, m; NaN beyond 14 m."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    rays = rays @ level_from_camera().T
     ahead = np.linspace(0.3, 14, 30_000)
     highest = np.maximum.accumulate((profile(ahead) - HEIGHT) / ahead)  # so far: a ray ends where it meets ground first
-    meets = np.searchsorted(highest, rays[..., 2] / rays[..., 0])
+    meets = np.searchsorted(highest, RAYS[..., 2] / RAYS[..., 0])
     distance = np.append(ahead, np.nan)[np.minimum(meets, len(ahead))]
-    return camera.fx * camera.baseline * rays[..., 0] / distance  # type: ignore[no-any-return]
+    return np.asarray(CAMERA.fx * CAMERA.baseline * RAYS[..., 0] / distance)
 
 
 def blank_frame(camera: StereoCamera = CAMERA, stamp: int = 7) -> StereoFrame:
@@ -55,10 +49,11 @@ def blank_frame(camera: StereoCamera = CAMERA, stamp: int = 7) -> StereoFrame:
     return StereoFrame(stamp, image, image, camera)
 
 
+FRAME = blank_frame()
+
+
 def as_disparity(pixels: Array, camera: StereoCamera = CAMERA, stamp: int = 7) -> Disparity:
-    known = np.isfinite(pixels)
-    source = np.where(known, PixelOrigin.MEASURED, PixelOrigin.UNKNOWN).astype(np.uint8)
-    return Disparity(stamp, pixels.astype(np.float32), source, known.astype(np.float32), camera=camera)
+    return disparity_of(pixels, stamp=stamp, camera=camera)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """Fuse merges many frames into one grid: aligned, weighted, and corrected by later frames."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
@@ -16,14 +14,11 @@ from stages.terrain.fused_map import SHARED_SHARE
 from stages.terrain.map_registration import frame_grid, register
 from tests.conftest import slow
 from tests.stages.running import Running
-from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, part, rolling
+from tests.stages.terrain.region_scene import MOUNT, SECOND, START, cell, centres, drive, flat, fused, part, rolling
 
 
 def test_frames_at_any_heading_make_one_map_of_the_ground():
-    fuse = Running(Fuse())
-    for frame in range(12):
-        cloud, pose = drive(frame)
-        terrain = fuse(cloud, pose, MOUNT)
+    _, terrain = fused(drive(frame) for frame in range(12))
     assert (terrain.frame_id, terrain.stamp) == ("odom", START + 11 * SECOND)
     error = terrain.layers["elevation"] - rolling(*centres(terrain))
     known = np.isfinite(error)
@@ -36,10 +31,8 @@ def test_a_rock_seen_from_two_headings_keeps_its_place():
     def with_rock(x, y):
         return np.where(np.hypot(x - 1.0, y - 2.0) < 0.3, 0.25, 0.0)
 
-    fuse = Running(Fuse())
-    for frame, at in enumerate([(-3.0, 2.0, 0.0), (1.0, -2.0, np.pi / 2), (4.0, 5.0, np.radians(-135))]):
-        cloud, pose = drive(frame, with_rock, at=at)
-        terrain = fuse(cloud, pose, MOUNT)
+    places = (-3.0, 2.0, 0.0), (1.0, -2.0, np.pi / 2), (4.0, 5.0, np.radians(-135))
+    _, terrain = fused(drive(frame, with_rock, at=at) for frame, at in enumerate(places))
     x, y = centres(terrain)
     rock = terrain.layers["elevation"] > 0.125
     assert rock.sum() * 0.05**2 == pytest.approx(np.pi * 0.3**2, rel=0.1)
@@ -57,9 +50,7 @@ def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch)
     heights = iter((-0.2, -0.1))
     use_whole_frames(monkeypatch)
     monkeypatch.setattr("stages.terrain.fuse.frame_grid", hiding)
-    fuse = Running(Fuse())
-    fuse(*drive(0, flat, at=(0.0, 0.0, 0.0)), MOUNT)
-    terrain = fuse(*drive(1, flat, at=(0.0, 0.0, 1.2)), MOUNT)
+    _, terrain = fused(drive(frame, flat, at=(0.0, 0.0, 1.2 * frame)) for frame in range(2))
     assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
     assert np.isnan(cell(terrain, -5.0, 0.02, "occluded"))
     assert np.isnan(cell(terrain, 1.02, 0.02))
@@ -75,18 +66,12 @@ def use_whole_frames(monkeypatch):
 
 def test_a_mean_over_frames_is_weighted_by_inverse_variance(monkeypatch):
     use_whole_frames(monkeypatch)
-    fuse = Running(Fuse(tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0))
-    clouds = [
-        drive(0, flat, at=(0.0, 0.0, 0.0)),
-        drive(1, lambda x, y: flat(x, y) + 0.01, sigma=0.04, at=(0.0, 0.0, 0.0)),
-    ]
-    clouds[1] = (clouds[1][0], replace(clouds[1][1], position=[0, 0, 0]))
-    clouds[1] = (replace(clouds[1][0], points=clouds[1][0].points + np.float32([0, 0, 0.01])), clouds[1][1])
+    first, (cloud, pose) = (drive(frame, flat, sigma, at=(0.0, 0.0, 0.0)) for frame, sigma in ((0, 0.02), (1, 0.04)))
+    frames = first, (replace(cloud, points=cloud.points + np.float32([0, 0, 0.01])), pose)
     local = [
-        frame_grid(cloud, register(Fuse(), cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in clouds
+        frame_grid(cloud, register(Fuse(), cloud, pose, MOUNT)[0], 0.05, 8.0).terrain.layers for cloud, pose in frames
     ]
-    for cloud, pose in clouds:
-        terrain = fuse(cloud, pose, MOUNT)
+    fuse, terrain = fused(frames, tilt_sigma=0.0, height_sigma=0.0, position_sigma=0.0)
     one, other = (layers["variance"].astype(float) + fuse.alignment_sigma**2 for layers in local)
     share = (1 / other) / (1 / one + 1 / other)
     elevation = terrain.layers["elevation"][40:360, 40:360]
@@ -100,7 +85,7 @@ def test_a_mean_over_frames_is_weighted_by_inverse_variance(monkeypatch):
 def test_position_errors_add_to_the_variance_of_steep_cells():
     variance, steep = {}, 0.2
     for position in (0.0, 0.05):
-        terrain = Running(Fuse(position_sigma=position))(*drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0)), MOUNT)
+        _, terrain = fused([drive(0, lambda x, y: steep * x, at=(0.0, 0.0, 0.0))], position_sigma=position)
         variance[position] = terrain.layers["variance"]
     known = np.isfinite(variance[0.0])
     added = float(np.mean((variance[0.05] - variance[0.0])[known]))
@@ -108,22 +93,18 @@ def test_position_errors_add_to_the_variance_of_steep_cells():
 
 
 def test_many_frames_do_not_reduce_the_variance_they_share():
-    fuse = Running(Fuse(alignment_sigma=0.01, position_sigma=0.0))
-    for frame in range(40):
-        cloud, pose = drive(frame, at=(0.0, 0.0, 0.3))
-        terrain = fuse(cloud, pose, MOUNT)
-        if frame == 0:
-            single = terrain.layers["variance"]
-    known = (terrain.layers["frames"] > 35) & np.isfinite(single)
-    assert np.all(terrain.layers["variance"][known] >= 0.99 * SHARED_SHARE * np.nanmin(single))
-    assert np.all(terrain.layers["variance"][known] <= single[known])
+    layers, frames = {}, [drive(frame, at=(0.0, 0.0, 0.3)) for frame in range(40)]
+    for count in (1, 40):
+        _, terrain = fused(frames[:count], alignment_sigma=0.01, position_sigma=0.0)
+        layers[count] = terrain.layers
+    single, variance = layers[1]["variance"], layers[40]["variance"]
+    known = (layers[40]["frames"] > 35) & np.isfinite(single)
+    assert np.all(variance[known] >= 0.99 * SHARED_SHARE * np.nanmin(single))
+    assert np.all(variance[known] <= single[known])
 
 
 def test_cells_count_their_frames_and_keep_their_first_and_last_time():
-    fuse = Running(Fuse())
-    for frame in range(6):
-        cloud, pose = drive(frame, at=(1.0 * frame, 0.0, 0.0))
-        terrain = fuse(cloud, pose, MOUNT)
+    _, terrain = fused(drive(frame, at=(1.0 * frame, 0.0, 0.0)) for frame in range(6))
     assert [cell(terrain, 5.52, 0.02, layer) for layer in ("first", "last", "frames")] == [0.0, 3.0, 4.0]
     assert [cell(terrain, 8.52, 0.02, layer) for layer in ("first", "last", "frames")] == [2.0, 5.0, 4.0]
     assert np.isnan(cell(terrain, 1.0, 0.02, "first"))
@@ -144,9 +125,7 @@ def test_a_drifting_height_aligns_after_a_gap_and_makes_no_step(gap):
 
 
 def test_a_clock_that_jumps_by_years_keeps_the_map():
-    fuse = Running(Fuse())
-    for frame in range(2):
-        fuse(*drive(frame, flat, at=(0.0, 0.0, 0.0)), MOUNT)
+    fuse, _ = fused(drive(frame, flat, at=(0.0, 0.0, 0.0)) for frame in range(2))
     cloud, pose = drive(2, flat, at=(0.0, 0.0, 0.0))
     later = START + 1_700_000_000 * SECOND
     terrain = fuse(replace(cloud, stamp=later), replace(pose, stamp=later), MOUNT)
@@ -154,15 +133,12 @@ def test_a_clock_that_jumps_by_years_keeps_the_map():
 
 
 def test_a_pose_in_a_frame_without_a_name_makes_the_same_map():
-    maps = {}
-    for name in ("odom", ""):
-        fuse = Running(Fuse())
-        for frame in range(3):
-            cloud, pose = drive(frame)
-            maps[name] = fuse(cloud, replace(pose, frame_id=name), MOUNT)
-    assert maps[""].frame_id == ""
-    for layer, values in maps["odom"].layers.items():
-        np.testing.assert_array_equal(maps[""].layers[layer], values)
+    frames = [drive(frame) for frame in range(3)]
+    (_, named), (_, nameless) = (
+        fused((cloud, replace(pose, frame_id=name)) for cloud, pose in frames) for name in ("odom", "")
+    )
+    assert nameless.frame_id == ""
+    np.testing.assert_equal(dict(nameless.layers), dict(named.layers))
 
 
 def with_box(x, y):
@@ -170,12 +146,10 @@ def with_box(x, y):
 
 
 def test_newer_frames_clear_an_obstacle_that_is_gone():
-    fuse = Running(Fuse())
-    for frame in range(10):
-        cloud, pose = drive(frame, with_box if frame < 5 else flat, at=(0.05 * frame, 0.0, 0.0))
-        terrain = fuse(cloud, pose, MOUNT)
-        if frame == 4:
-            assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
+    fuse, terrain = fused(drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0)) for frame in range(5))
+    assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
+    for frame in range(5, 10):
+        terrain = fuse(*drive(frame, flat, at=(0.05 * frame, 0.0, 0.0)), MOUNT)
     assert np.nanmax(np.abs(terrain.layers["elevation"])) < 0.01
     assert cell(terrain, 4.02, 0.02, "first") >= 5.0
     assert cell(terrain, 4.02, 0.02, "contradictions") >= 1
@@ -184,12 +158,8 @@ def test_newer_frames_clear_an_obstacle_that_is_gone():
 
 
 def test_one_uncertain_frame_does_not_overturn_many():
-    fuse = Running(Fuse())
-    for frame in range(6):
-        cloud, pose = drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0))
-        fuse(cloud, pose, MOUNT)
-    cloud, pose = drive(6, flat, at=(0.3, 0.0, 0.0), sigma=0.3)
-    terrain = fuse(cloud, pose, MOUNT)
+    frames = [drive(frame, with_box, at=(0.05 * frame, 0.0, 0.0)) for frame in range(6)]
+    _, terrain = fused([*frames, drive(6, flat, at=(0.3, 0.0, 0.0), sigma=0.3)])
     assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
     assert cell(terrain, 4.02, 0.02, "last") == 5.0
 
@@ -198,8 +168,7 @@ def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():
     fuse = Running(Fuse())
     for frame in range(16):
         ground, sigma = (with_box, 0.05) if frame >= 10 else (flat, 0.01)
-        cloud, pose = drive(frame, ground, at=(0.0, 0.0, 0.0), sigma=sigma)
-        terrain = fuse(cloud, pose, MOUNT)
+        terrain = fuse(*drive(frame, ground, at=(0.0, 0.0, 0.0), sigma=sigma), MOUNT)
         height, variance = (cell(terrain, 4.02, 0.02, name) for name in ("elevation", "variance"))
         if frame >= 10:
             assert height + np.sqrt(variance) > 0.45
@@ -208,18 +177,16 @@ def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():
 
 
 def test_an_empty_cloud_changes_nothing():
-    fuse = Running(Fuse())
     cloud, pose = drive(0)
-    assert np.isnan(fuse(part(cloud, np.s_[:0]), pose, MOUNT).layers["elevation"]).all()
+    fuse, terrain = fused([(part(cloud, np.s_[:0]), pose)])
+    assert np.isnan(terrain.layers["elevation"]).all()
     assert np.isfinite(fuse(*drive(1), MOUNT).layers["elevation"]).any()
 
 
 def test_points_without_a_sigma_do_not_enter_the_map():
-    fuse, (cloud, pose) = Running(Fuse()), drive(0)
-    unsure = cloud.sigma.copy()
-    left = cloud.points[:, 1] > 0
-    unsure[left] = np.nan
-    terrain = fuse(replace(cloud, sigma=unsure), pose, MOUNT)
+    cloud, pose = drive(0)
+    unsure = np.where(cloud.points[:, 1] > 0, np.float32(np.nan), cloud.sigma)
+    fuse, terrain = fused([(replace(cloud, sigma=unsure), pose)])
     assert 0 < np.isfinite(terrain.layers["elevation"]).sum() < 0.6 * len(cloud.points) / 6
     terrain = fuse(*drive(1), MOUNT)
     known = np.isfinite(terrain.layers["elevation"])
@@ -230,15 +197,14 @@ def test_filled_points_do_not_enter_the_map():
     cloud, pose = drive(0)
     filled = cloud.points[:, 1] > 0
     partly_filled = replace(cloud, source=np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8))
-    terrain, expected = Running(Fuse())(partly_filled, pose, MOUNT), Running(Fuse())(part(cloud, ~filled), pose, MOUNT)
+    (_, terrain), (_, expected) = (fused([(points, pose)]) for points in (partly_filled, part(cloud, ~filled)))
     assert np.isfinite(terrain.layers["elevation"]).any()
-    for name, layer in expected.layers.items():
-        np.testing.assert_array_equal(terrain.layers[name], layer)
+    np.testing.assert_equal(dict(terrain.layers), dict(expected.layers))
 
 
 def test_a_map_of_a_log_is_not_continued_from_another_place():
     fuse, (cloud, pose) = Fuse(), drive(0)
-    terrain = Running(fuse)(cloud, pose, MOUNT)
+    _, terrain = fused([(cloud, pose)])
     assert fuse(cloud, pose, MOUNT, state=fuse.resumed([terrain])).stamp == START
     for shift in ([0.06, 0, 0], [0, -0.06, 0]):
         state = fuse.resumed([terrain])
@@ -246,12 +212,9 @@ def test_a_map_of_a_log_is_not_continued_from_another_place():
             fuse(cloud, replace(pose, position=pose.position + shift), MOUNT, state=state)
 
 
-def test_a_window_smaller_than_a_frame_is_refused():
+def test_a_small_window_and_a_range_of_too_many_cells_are_refused():
     with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
         Fuse(max_range=8.0, window=15.0)
-
-
-def test_a_range_of_too_many_cells_is_refused_by_its_own_name():
     with pytest.raises(ValueError, match=r"^FuseRegion\.max_range = 150 m makes a map 6000 cells"):
         FuseRegion(max_range=150.0)
 
@@ -259,7 +222,8 @@ def test_a_range_of_too_many_cells_is_refused_by_its_own_name():
 TRACK = """
 import sys
 import numpy as np
-from stages import Fuse, PointCloud, Pose, Transform
+from stages import Fuse, Pose, Transform
+from tests.stages.builders import cloud_of
 from tests.stages.running import Running
 def peak():
     with open("/proc/self/status") as status:
@@ -267,13 +231,10 @@ def peak():
 before, fuse, step = peak(), Running(Fuse(max_range=11.0, window=25.0)), 8.0
 x, y = (axis.ravel() + 0.025 for axis in np.meshgrid(np.arange(-4, 4, 0.05), np.arange(-10, 10, 0.05)))
 points = np.column_stack([x, y, 0.1 * np.sin(x)]).astype(np.float32)
-n = len(points)
 sensor = Transform("level", "camera", np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0, 0, 1.0]))
 for frame in range(int(sys.argv[1]) // 8):
     pose = Pose(frame + 1, [frame * step, 0.0, 0.0], [-0.5, 0.5, -0.5, 0.5], "odom", "camera")
-    cloud = PointCloud(frame + 1, points, np.zeros((n, 3), np.uint8), np.full(n, 0.02, np.float32),
-                       np.arange(n, dtype=np.int32), "level", sensor=sensor)
-    fuse(cloud, pose)
+    fuse(cloud_of(points, stamp=frame + 1, sensor=sensor), pose)
 tiles = fuse.state.cells.tiles.values()
 cells = sum(int((tile["frames"] > 0).sum()) for tile in tiles)
 print(cells, sum(tile.nbytes for tile in tiles) / 1e6, peak() - before)

@@ -1,7 +1,5 @@
 """Tilt and overlap separate the errors of pose and map, whatever the pose states."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

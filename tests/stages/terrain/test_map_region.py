@@ -1,7 +1,5 @@
 """Few maps of a region are made, and laid over each other they are the whole region."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -26,9 +24,9 @@ def region(stamp: int, x: float, turn: float = 0.0, frame: str = "odom", epoch: 
     return Region(stamp, Tiles(CELL), 0.5, level, epoch, (0, col, 1, col + 1), False)
 
 
-def mapped(regions: list[Region], step: float) -> list[ElevationMap]:
+def mapped(regions: list[Region], step: float, window: float = 2.0) -> list[ElevationMap]:
     """The maps of a run."""
-    stage = MapRegion(step=step, window=2.0)
+    stage = MapRegion(step=step, window=window)
     state = stage.start()
     found = [stage(region, state=state) for region in regions]
     return [item for item in [*found, None if found[-1] else stage.flush(state)] if item is not None]
@@ -74,13 +72,9 @@ def test_a_map_precedes_a_jump_that_the_next_one_would_not_span():
 
 @pytest.mark.parametrize(("step", "ways"), [(0.0, [1.5] * 5), (1.0, [0.4] * 6), (2.0, [0.3, 0.3, 6.0, 0.3, 24.0, 1.0])])
 def test_the_maps_laid_over_each_other_are_the_whole_region(step, ways):
-    fuse, maps, whole = Running(FuseRegion()), MapRegion(step=step, window=5.0), {}
-    state, found = maps.start(), []
-    for frame, x in enumerate(np.cumsum(ways)):
-        cloud, pose = drive(frame, at=(float(x) - 9, 0.3 * frame, 0.2 * frame))
-        found.append(maps(fuse(cloud, pose, MOUNT), state=state))
-    found.append(None if found[-1] else maps.flush(state))
-    for terrain in (item for item in found if item is not None):
+    fuse, whole = Running(FuseRegion()), {}
+    frames = (drive(frame, at=(float(x) - 9, 0.3 * frame, 0.2 * frame)) for frame, x in enumerate(np.cumsum(ways)))
+    for terrain in mapped([fuse(*frame, MOUNT) for frame in frames], step, window=5.0):
         row, col = (round(place / 0.05) for place in terrain.origin[::-1])
         for name in ("elevation", "frames"):
             layer = np.nan_to_num(terrain.layers[name])
@@ -106,5 +100,4 @@ def test_fuse_returns_the_maps_of_both_stages():
         given = *drive(frame), MOUNT
         found, wanted = at_once(*given), maps(fuse(*given))
         assert (found.origin, found.shape, found.epoch) == (wanted.origin, wanted.shape, wanted.epoch)
-        for name, layer in wanted.layers.items():
-            np.testing.assert_array_equal(found.layers[name], layer)
+        np.testing.assert_equal(dict(found.layers), dict(wanted.layers))

@@ -1,7 +1,5 @@
 """Frames are aligned to the regional map, refused where they do not fit, and reset it if that continues."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +11,7 @@ from stages import Fuse, Pose, Transform
 from stages.terrain.map_registration import register
 from tests.conftest import slow
 from tests.stages.running import Running
-from tests.stages.terrain.region_scene import MOUNT, START, centres, drive, flat, rolling
+from tests.stages.terrain.region_scene import MOUNT, START, centres, drive, flat, fused, rolling
 
 
 def heights(cloud, placed):
@@ -28,10 +26,8 @@ def test_frames_with_tilt_errors_join_without_a_seam():
     rng, fuse, seams, before = np.random.default_rng(3), Running(Fuse()), [], None
     for frame in range(12):
         cloud, pose = drive(frame, tilt=tuple(rng.normal(0, np.radians(0.4), 2)), noise=0.01)
-        now = [
-            heights(cloud, placed)
-            for placed in (register(Fuse(), cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level)
-        ]
+        places = register(Fuse(), cloud, pose, MOUNT)[0], fuse(cloud, pose, MOUNT).level
+        now = [heights(cloud, placed) for placed in places]
         if before is not None:
             off = [one - other for one, other in zip(before, now, strict=True)]
             seams.append([1.4826 * np.nanmedian(np.abs(values - np.nanmedian(values))) for values in off])
@@ -90,12 +86,10 @@ def test_a_pose_of_the_camera_gives_the_map_of_a_pose_of_the_rover():
     base = Transform("odom", "base_link", Rotation.from_quat(pose.quaternion).as_matrix(), pose.position)
     camera = base.after(MOUNT.base_from_camera)
     turn = Rotation.from_matrix(camera.rotation).as_quat()
-    seen = [
-        Running(Fuse())(cloud, pose, MOUNT),
-        Running(Fuse())(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera")),
-    ]
-    np.testing.assert_allclose(seen[0].level.translation, seen[1].level.translation, atol=1e-9)
-    np.testing.assert_allclose(seen[0].layers["elevation"], seen[1].layers["elevation"], atol=1e-5)
+    one = Running(Fuse())(cloud, pose, MOUNT)
+    other = Running(Fuse())(cloud, Pose(pose.stamp, camera.translation, turn, "odom", "camera"))
+    np.testing.assert_allclose(one.level.translation, other.level.translation, atol=1e-9)
+    np.testing.assert_allclose(one.layers["elevation"], other.layers["elevation"], atol=1e-5)
 
 
 def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
@@ -108,10 +102,15 @@ def test_roll_and_pitch_of_the_pose_do_not_tilt_the_map():
     np.testing.assert_allclose(placed.translation, pose.position, atol=1e-9)
 
 
-def upside_down(pose):
-    return replace(
-        pose, quaternion=(Rotation.from_euler("x", 180, degrees=True) * Rotation.from_quat(pose.quaternion)).as_quat()
-    )
+def leant(pose, degrees):
+    """The pose in a frame that leans by this."""
+    lean = Rotation.from_euler("x", degrees, degrees=True)
+    turned = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
+    return replace(pose, position=lean.as_matrix() @ pose.position, quaternion=turned)
+
+
+def raised(pose, up):
+    return replace(pose, position=pose.position + np.array([0, 0, up]))
 
 
 @pytest.mark.parametrize(
@@ -120,13 +119,12 @@ def upside_down(pose):
         (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "put stages.Level before it"),
         (lambda cloud, pose: (replace(cloud, sensor=None), pose), "lacks its camera's place"),
         (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is of 'mast', and no transform"),
-        (lambda cloud, pose: (cloud, upside_down(pose)), "180 degrees off the vertical .* whose z points up"),
+        (lambda cloud, pose: (cloud, leant(pose, 180)), "180 degrees off the vertical .* whose z points up"),
         (lambda cloud, pose: (replace(cloud, stamp=START), pose), "is not later than the last one"),
     ],
 )  # fmt: skip
 def test_a_frame_that_cannot_be_registered_does_not_change_the_map(change, message):
-    fuse = Running(Fuse())
-    fuse(*drive(0), MOUNT)
+    fuse, _ = fused([drive(0)])
     before = fuse.state.cells.read(-300, -300, 600, 600)
     with pytest.raises(ValueError, match=message):
         fuse(*change(*drive(1)), MOUNT)
@@ -135,11 +133,8 @@ def test_a_frame_that_cannot_be_registered_does_not_change_the_map(change, messa
 
 @pytest.mark.parametrize(("degrees", "warned"), [(0, False), (3, False), (12, True)])
 def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
-    fuse, lean = Running(Fuse()), Rotation.from_euler("x", degrees, degrees=True)
-    for frame in range(4):
-        cloud, pose = drive(frame)
-        quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
-        fuse(cloud, replace(pose, position=lean.as_matrix() @ pose.position, quaternion=quaternion), MOUNT)
+    frames = (drive(frame) for frame in range(4))
+    fuse, _ = fused((cloud, leant(pose, degrees)) for cloud, pose in frames)
     found = fuse.finding()
     assert (found is not None) == warned
     if found:
@@ -148,75 +143,61 @@ def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
 
 
 def test_a_refused_frame_does_not_count_as_leaning():
-    fuse, lean = Running(Fuse()), Rotation.from_euler("x", 29, degrees=True)
-    for frame in range(3):
-        fuse(*drive(frame), MOUNT)
+    fuse, _ = fused(drive(frame) for frame in range(3))
     for frame in (3, 4):
         cloud, pose = drive(frame)
-        quaternion = (lean * Rotation.from_quat(pose.quaternion)).as_quat()
         with pytest.raises(ValueError, match="left out of the regional map"):
-            fuse(cloud, replace(pose, position=pose.position + np.array([0, 0, 5.0]), quaternion=quaternion), MOUNT)
+            fuse(cloud, raised(leant(pose, 29), 5.0), MOUNT)
     assert fuse.finding() is None
 
 
 @pytest.mark.parametrize("up", [0.6, -0.4, 1e6, *slow(30.0, -1e3)])
 def test_a_pose_that_jumps_is_refused_and_the_third_time_resets_the_map(up):
-    fuse, jump = Running(Fuse()), np.array([0, 0, up])
-    for frame in range(5):
-        terrain = fuse(*drive(frame), MOUNT)
+    fuse, terrain = fused(drive(frame) for frame in range(5))
     for frame in (5, 6):
         cloud, pose = drive(frame)
         with pytest.raises(ValueError, match=r"m and 0\.0 degrees off the map, .* left out of the regional map"):
-            fuse(cloud, replace(pose, position=pose.position + jump), MOUNT)
+            fuse(cloud, raised(pose, up), MOUNT)
     again = fuse(*drive(7), MOUNT)  # the map goes on
     assert fuse.finding() is None
     assert again.layers["frames"].max() > terrain.layers["frames"].max()
     for frame in (8, 9, 10):
         cloud, pose = drive(frame)
-        given = cloud, replace(pose, position=pose.position + jump), MOUNT
+        given = cloud, raised(pose, up), MOUNT
         try:
             fresh = fuse(*given)
         except ValueError:
             assert frame < 10
-    for name, layer in Running(Fuse())(*given).layers.items():
-        np.testing.assert_array_equal(fresh.layers[name], layer)
+    np.testing.assert_equal(dict(fresh.layers), dict(Running(Fuse())(*given).layers))
     found = fuse.finding()
-    assert found is not None
     assert found.severity is Severity.WARNING
     assert "The regional map was reset 1 time (frame odom)" in found.sentence
 
 
-def leaning(frame, degrees, up=0.0):
+def leaning(frame, degrees):
     cloud, pose = drive(frame)
     turned = Rotation.from_euler("y", degrees, degrees=True).apply(cloud.points).astype(np.float32)
-    return replace(cloud, points=turned), replace(pose, position=np.add(pose.position, (0, 0, up)))
+    return replace(cloud, points=turned), pose
 
 
 @pytest.mark.parametrize(("sigmas", "degrees"), [
     ({"tilt_sigma": 0.05}, (0, 3, -4, 5, -3, 4)), ({"height_sigma": 0.002}, (0.0, 0.4, -0.3, 0.5, -0.4, 0.3)),
 ])  # fmt: skip
 def test_a_change_within_the_stated_height_and_tilt_errors_is_no_jump(sigmas, degrees):
-    fuse = Running(Fuse(**sigmas))
-    for frame, angle in enumerate(degrees):
-        terrain = fuse(*leaning(frame, angle), MOUNT)
+    fuse, terrain = fused((leaning(frame, angle) for frame, angle in enumerate(degrees)), **sigmas)
     assert terrain.layers["frames"].max() == len(degrees)
     assert fuse.finding() is None
 
 
 def test_a_tilt_that_jumps_is_refused_with_its_degrees():
-    fuse = Running(Fuse())
-    for frame in range(3):
-        fuse(*drive(frame), MOUNT)
+    fuse, _ = fused(drive(frame) for frame in range(3))
     with pytest.raises(ValueError, match=r"and [3-6]\.\d degrees off the map"):
         fuse(*leaning(3, 6), MOUNT)
 
 
 def test_a_pose_in_another_frame_resets_the_map():
-    fuse, fresh = Running(Fuse()), Running(Fuse())
-    fuse(*drive(0), MOUNT)
     cloud, pose = drive(1)
-    lost = replace(pose, frame_id="visual_odom/2")
-    begun, expected = fuse(cloud, lost, MOUNT), fresh(cloud, lost, MOUNT)
+    lost = cloud, replace(pose, frame_id="visual_odom/2")
+    (_, begun), (_, expected) = fused([drive(0), lost]), fused([lost])
     assert begun.frame_id == "visual_odom/2"
-    for name, layer in expected.layers.items():
-        np.testing.assert_array_equal(begun.layers[name], layer)
+    np.testing.assert_equal(dict(begun.layers), dict(expected.layers))
