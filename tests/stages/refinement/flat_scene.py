@@ -3,12 +3,17 @@
 import numpy as np
 
 from stages.data import StereoCamera, StereoFrame
+from tests.stages.builders import disparity_of
 
 SHAPE = HEIGHT, WIDTH = 120, 160
+CAMERA = StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT)
+GRAY = StereoFrame(5, *np.full((2, *SHAPE), 100, np.uint8), CAMERA)
 
 
-def flat_scene(level=8.0):
-    """A frame of one gray, all of it matched at `level` with full confidence: (frame, pixels, source, confidence)."""
-    image = np.full(SHAPE, 100, np.uint8)
-    frame = StereoFrame(5, image, image, StereoCamera(300, 300, 80, 60, 0.1, WIDTH, HEIGHT))
-    return frame, np.full(SHAPE, level, np.float32), np.ones(SHAPE, np.uint8), np.ones(SHAPE, np.float32)
+def flat(level=8.0):
+    return np.full(SHAPE, level, np.float32)
+
+
+def matched(pixels, confidence=None):
+    """Matches of the frame, with full confidence by default."""
+    return disparity_of(pixels, confidence=confidence, stamp=5)

@@ -18,7 +18,6 @@ def render_planes(coefficients, labels):
     return a * x + b * y + c
 
 
-@pytest.fixture
 def tiles():
     """Six segments of 24x20 px, each its own plane, with noise, a fifth of outliers and a tenth of holes."""
     rng = np.random.default_rng(3)
@@ -33,33 +32,32 @@ def tiles():
     return disparity.astype(np.float32), labels, truth
 
 
-def test_outliers_and_holes_do_not_move_the_planes(tiles):
-    disparity, labels, truth = tiles
-    planes = fit_planes(disparity, labels, 6, ALIKE, 64)
-    clean = render_planes(truth, labels)
-    assert np.abs(render_planes(planes.coefficients, labels) - clean).max() < 0.05
+DISPARITY, LABELS, TRUTH = tiles()
+
+
+def test_outliers_and_holes_do_not_move_the_planes():
+    planes = fit_planes(DISPARITY, LABELS, 6, ALIKE, 64)
+    assert np.abs(render_planes(planes.coefficients, LABELS) - render_planes(TRUTH, LABELS)).max() < 0.05
     assert planes.inlier_share == pytest.approx(0.8, abs=0.06)
     assert planes.valid_share == pytest.approx(0.9, abs=0.05)
 
 
-def test_equals_the_plain_reference_with_the_same_draws_and_weights(tiles):
-    disparity, labels, _ = tiles
+def test_equals_the_plain_reference_with_the_same_draws_and_weights():
     weights = np.random.default_rng(8).uniform(0.05, 1, SHAPE).astype(np.float32)
     for some in (ALIKE, weights):
-        ours, plain = (fit(disparity, labels, 6, some, 16, seed=11) for fit in (fit_planes, fit_planes_reference))
+        ours, plain = (fit(DISPARITY, LABELS, 6, some, 16, seed=11) for fit in (fit_planes, fit_planes_reference))
         assert ours.coefficients[:, :2] == pytest.approx(plain.coefficients[:, :2], abs=2e-5)
-        images = [render_planes(planes.coefficients, labels) for planes in (ours, plain)]
+        images = [render_planes(planes.coefficients, LABELS) for planes in (ours, plain)]
         assert images[0] == pytest.approx(images[1], abs=1e-4)
         assert np.array_equal(ours.inlier_share, plain.inlier_share)
         assert np.array_equal(ours.valid_share, plain.valid_share)
-    unweighted = render_planes(fit_planes(disparity, labels, 6, ALIKE, 16, seed=11).coefficients, labels)
+    unweighted = render_planes(fit_planes(DISPARITY, LABELS, 6, ALIKE, 16, seed=11).coefficients, LABELS)
     assert np.abs(images[0] - unweighted).max() > 1e-3
 
 
-def test_a_segment_is_fitted_alike_whatever_the_others_hold(tiles):
-    disparity, labels, _ = tiles
-    alone = np.where(labels == 4, disparity, np.float32(np.nan))
-    among, single = (fit_planes(given, labels, 6, ALIKE, 64, seed=9).coefficients for given in (disparity, alone))
+def test_a_segment_is_fitted_alike_whatever_the_others_hold():
+    alone = np.where(LABELS == 4, DISPARITY, np.float32(np.nan))
+    among, single = (fit_planes(given, LABELS, 6, ALIKE, 64, seed=9).coefficients for given in (DISPARITY, alone))
     assert np.array_equal(among[4], single[4])
 
 

@@ -89,37 +89,40 @@ def test_ground_nearly_four_times_as_near_as_the_range_is_known(near_ground, pip
     assert (error > 0.5).mean() < off  # `rover` finds it at half the size, and `fast` at a quarter
 
 
+def stated_and_right(scenes):
+    """The confidence of each known pixel of (frame, disparities, truth) by `rover`, and whether it is right."""
+    stated, right = [], []
+    for frame, disparities, truth in scenes:
+        refined = stereo_part("rover", frame, disparities, entry="rectified")["disparity"]
+        error = np.abs(refined.pixels - truth)
+        stated.append(refined.confidence[np.isfinite(error)])
+        right.append(error[np.isfinite(error)] <= 1)
+    return np.concatenate(stated), np.concatenate(right)
+
+
 @pytest.mark.slow
 def test_confidence_is_the_share_that_is_right_on_a_held_out_frame():
-    stated, right = [], []
+    scenes = []
     for seed, abundance in ((21, 0.08), (22, 0.18)):
         simulation = Simulation(scene="gravel", frames=2, width=480, height=360, seed=seed, abundance=abundance)
         camera, found = simulation.camera, simulation.frame(1)
         truth = camera.fx * camera.baseline / found.depth
-        frame = StereoFrame(seed, *found.images, camera)
-        refined = stereo_part("rover", frame, 72, entry="rectified")["disparity"]
-        scored = np.isfinite(refined.pixels) & (truth > 0) & (truth < 70)
-        stated.append(refined.confidence[scored])
-        right.append(np.abs(refined.pixels - truth)[scored] <= 1)
-    claimed, found_right = np.concatenate(stated), np.concatenate(right)
+        searched = np.where((truth > 0) & (truth < 70), truth, np.nan)
+        scenes.append((StereoFrame(seed, *found.images, camera), 72, searched))
+    claimed, right = stated_and_right(scenes)
     for low, high, tolerance in ((0.5, 0.8, 0.2), (0.8, 0.95, 0.1), (0.95, 1.01, 0.02)):
         within = (claimed >= low) & (claimed < high)
         assert within.sum() > 1000
-        assert found_right[within].mean() == pytest.approx(claimed[within].mean(), abs=tolerance)
-    assert found_right.mean() == pytest.approx(claimed.mean(), abs=0.03)
+        assert right[within].mean() == pytest.approx(claimed[within].mean(), abs=tolerance)
+    assert right.mean() == pytest.approx(claimed.mean(), abs=0.03)
 
 
 @pytest.mark.slow
 def test_confidence_is_the_share_right_of_real_and_of_simulated_pixels():
-    pools = []
-    for cases in (simulated(), real(data_folder("middlebury-q"))):
-        stated, right = [], []
-        for case in cases:
-            refined = stereo_part("rover", case.frame, case.disparities, entry="rectified")["disparity"]
-            scored = np.isfinite(refined.pixels) & np.isfinite(case.truth)
-            stated.append(refined.confidence[scored])
-            right.append(np.abs(refined.pixels - case.truth)[scored] <= 1)
-        pools.append((np.concatenate(stated), np.concatenate(right)))
+    pools = [
+        stated_and_right((case.frame, case.disparities, case.truth) for case in cases)
+        for cases in (simulated(), real(data_folder("middlebury-q")))
+    ]
     for low, high in ((0.5, 0.7), (0.7, 0.85), (0.85, 0.95), (0.95, 1.01)):
         within = [(stated >= low) & (stated < high) for stated, _ in pools]
         claimed = [stated[area].mean() for (stated, _), area in zip(pools, within, strict=True)]
