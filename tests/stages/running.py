@@ -1,7 +1,5 @@
 """Stages with state as the engine calls them: each with the state of one run."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -1,7 +1,5 @@
 """The state of a stage can be saved halfway through a run and restored: the results have the same bits."""
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
@@ -11,23 +9,11 @@ import stages
 from flow.runtime.graph import has_state
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
-from stages import (
-    CheckMatches,
-    CheckTilt,
-    Disparity,
-    Fuse,
-    FuseRegion,
-    Level,
-    MapRegion,
-    Mount,
-    PoseFilter,
-    Reproject,
-    StereoFrame,
-    Tilt,
-    VisualOdometry,
-)
+from stages import CheckMatches, CheckTilt, Fuse, FuseRegion, Level, MapRegion, PoseFilter, Reproject, VisualOdometry
+from stages.data import Mount, StereoFrame, Tilt
 from stages.stage import restore, snapshot
-from tests.stages.localisation.drive import Drive, motions
+from tests.stages.builders import disparity_of
+from tests.stages.localisation.drive import Drive, readings
 from tests.stages.running import Running
 
 FRAMES = 4
@@ -48,10 +34,8 @@ def inputs():
         cloud = Level()(Reproject()(frame, disparity), Tilt(stamp, base.rotation[2]), mount)
         given[FuseRegion].append((cloud, simulation.odometry[5 + 5 * index], mount))
         given[MapRegion].append((fuse(*given[FuseRegion][-1]),))
-    moved = motions(drive.cameras(), drive.stamps())
-    tilts = [Tilt(motion.stamp, up) for motion, up in zip(moved, drive.ups(), strict=True)]
-    upright = [(motion, tilt, Mount(0, drive.mount)) for motion, tilt in zip(moved, tilts, strict=True)]
-    nothing = Disparity(0, *(np.zeros((8, 8), kind) for kind in (np.float32, np.uint8, np.float32)))
+    upright = [(*reading, Mount(0, drive.mount)) for reading in readings(drive)]
+    nothing = disparity_of(np.full((8, 8), np.nan))
     given[Fuse] = given[FuseRegion]
     return given | {PoseFilter: upright, CheckTilt: upright, CheckMatches: [(nothing,)] * FRAMES}
 
@@ -69,7 +53,10 @@ def same(one, other):
     return one == other or (one != one and other != other)
 
 
-@pytest.mark.parametrize("kind", [VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, FuseRegion, MapRegion])
+KINDS = [VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, FuseRegion, MapRegion]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
     frames, stage = inputs[kind], MapRegion(step=5.0) if kind is MapRegion else kind()
     half, whole, first, fresh = len(frames) // 2 + 1, stage.start(), stage.start(), stage.start()
@@ -86,8 +73,7 @@ def test_a_run_in_two_parts_is_the_whole_run(inputs, kind):
 
 
 def test_every_stage_with_state_is_tried_above():
-    with_state = {kind for name in dir(stages) if has_state(kind := getattr(stages, name))}
-    assert with_state == {VisualOdometry, PoseFilter, CheckTilt, CheckMatches, Fuse, FuseRegion, MapRegion}
+    assert {kind for name in dir(stages) if has_state(kind := getattr(stages, name))} == set(KINDS)
 
 
 def test_a_snapshot_of_another_stage_is_refused():

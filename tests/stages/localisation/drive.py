@@ -1,7 +1,5 @@
 """A simulated drive without images: the motion of its camera and the readings of its inclinometer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -10,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.simulator import Simulation
-from stages.data import Array, CameraMotion, Transform
+from stages.data import Array, CameraMotion, Tilt, Transform
 from stages.localisation.tilt.causes import Evidence
 
 FRAMES = 50
@@ -85,6 +83,13 @@ class Drive:
         drift = np.arange(frames) * np.radians(self.odometry) ** 2
         stamps = np.array(self.stamps(frames))
         return Evidence(stamps, np.ones(frames, int), self.turns(frames), drift, ups, mount, self.ground(frames))
+
+
+def readings(drive: Drive, ups: Array | None = None, frames: int = FRAMES) -> list[tuple[CameraMotion, Tilt]]:
+    """Motion of the camera and tilt at each frame."""
+    moved = motions(drive.cameras(frames), drive.stamps(frames))
+    tilts = drive.ups(frames) if ups is None else ups
+    return [(motion, Tilt(motion.stamp, up)) for motion, up in zip(moved, tilts, strict=True)]
 
 
 def motions(cameras: list[Transform], stamps: list[int], segment: int = 1) -> list[CameraMotion]:

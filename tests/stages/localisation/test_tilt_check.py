@@ -1,7 +1,5 @@
 """CheckTilt judges the tilt by the frames in which the rover moved, and by the slope of the ground in view."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -12,19 +10,19 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Severity
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.data import Array
-from tests.stages.localisation.drive import FRAMES, Drive, motions
+from tests.stages.builders import cloud_of
+from tests.stages.localisation.drive import FRAMES, Drive, motions, readings
 from tests.stages.running import Running
 from tests.tilt_faults import flipped
 
 DRIVE = Drive(2, 8.0)
+MOUNT = Mount(0, DRIVE.mount)
+# Motion, tilt and mount of a rover that stands with a level camera.
+STANDING = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera"), Mount(0, np.eye(3))
 
 
 def checked(ups: Array, stage: Running, repeats: int = 1) -> list[TiltHealth]:
-    found = []
-    for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), ups, strict=True):
-        for _ in range(repeats):
-            found.append(stage(motion, Tilt(motion.stamp, up), Mount(0, DRIVE.mount)))
-    return found
+    return [stage(*reading, MOUNT) for reading in readings(DRIVE, ups) for _ in range(repeats)]
 
 
 def ground(slope: float, rocks: int = 0) -> PointCloud:
@@ -34,10 +32,7 @@ def ground(slope: float, rocks: int = 0) -> PointCloud:
     points = np.column_stack([x, np.ones_like(x), z]) + rng.normal(0, 0.01, (9000, 3))
     points[:rocks, 1] -= rng.uniform(0.1, 0.5, rocks)
     points = points @ Rotation.from_euler("x", slope, degrees=True).as_matrix().T
-    return PointCloud(
-        0, points.astype(np.float32), np.zeros((9000, 3), np.uint8), np.ones(9000, np.float32),
-        np.arange(9000, dtype=np.int32), "camera",
-    )  # fmt: skip
+    return cloud_of(points, frame_id="camera")
 
 
 def test_a_sound_tilt_is_reported_as_sound():
@@ -89,9 +84,9 @@ def test_frames_of_a_standing_rover_are_not_kept():
 
 def test_repeated_stamps_hide_no_fault():
     flip, stage = flipped(0), Running(CheckTilt())
-    for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
+    for motion, tilt in readings(DRIVE):
         stamp = motion.stamp // 10**9 * 10**9  # a clock of whole seconds
-        stage(replace(motion, stamp=stamp), Tilt(stamp, flip(up)), Mount(0, DRIVE.mount))
+        stage(replace(motion, stamp=stamp), Tilt(stamp, flip(tilt.up)), MOUNT)
     assert "The sign of pitch is flipped" in stage.finding().sentence
 
 
@@ -105,30 +100,22 @@ def test_a_fault_that_ends_halfway_is_reported_at_the_end():
 
 
 def test_the_slope_of_the_ground_ignores_rocks_and_the_frame_of_the_cloud():
-    motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
-    mount = Mount(0, np.eye(3))
+    sensor = Transform("level", "camera", Rotation.from_euler("y", 40, degrees=True).as_matrix(), np.ones(3))
     for slope in (0.0, 8.0, -15.0):
         cloud = ground(slope, rocks=1500)
-        health = Running(CheckTilt())(motion, tilt, mount, cloud)
-        assert abs(np.degrees(health.ground) - abs(slope)) < 0.5
-        sensor = Transform("level", "camera", Rotation.from_euler("y", 40, degrees=True).as_matrix(), np.ones(3))
-        moved = PointCloud(
-            0, sensor(cloud.points).astype(np.float32), cloud.colors, cloud.sigma, cloud.pixel, "level", sensor=sensor
-        )  # fmt: skip
-        assert abs(Running(CheckTilt())(motion, tilt, mount, moved).ground - health.ground) < 1e-3
-        points = cloud.points.copy()
-        points[::50, 0] = np.nan
-        gappy = replace(cloud, points=points)
-        assert abs(Running(CheckTilt())(motion, tilt, mount, gappy).ground - health.ground) < 1e-3
+        gaps = np.where(np.arange(len(cloud.points)) % 50, 0, np.float32(np.nan))[:, None]
+        moved, gappy = cloud_of(sensor(cloud.points), sensor=sensor), replace(cloud, points=cloud.points + gaps)
+        plain, other, holed = (Running(CheckTilt())(*STANDING, each).ground for each in (cloud, moved, gappy))
+        assert abs(np.degrees(plain) - abs(slope)) < 0.5
+        assert [other, holed] == pytest.approx([plain] * 2, abs=1e-3)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 4, 12])
 def test_ground_far_off_level_in_every_frame_is_a_warning(frames):
     """For example: the sign of pitch is wrong and the camera looks down by 14.6 degrees."""
-    stage, mount, tilt = Running(CheckTilt()), Mount(0, np.eye(3)), np.array([0, -1.0, 0])
-    for motion in motions(DRIVE.cameras(1), [0]) * frames:
-        health = stage(motion, Tilt(motion.stamp, tilt, "camera"), mount, ground(29.2))
-        assert health.fault == "up is off the ground"
+    stage = Running(CheckTilt())
+    for _ in range(frames):
+        assert stage(*STANDING, ground(29.2)).fault == "up is off the ground"
     found = stage.finding()
     assert found.severity is Severity.WARNING
     assert re.search(r"off level by 29\.\d degrees or more in (the only|every)", found.sentence), found.sentence
@@ -136,27 +123,21 @@ def test_ground_far_off_level_in_every_frame_is_a_warning(frames):
 
 
 def test_steep_ground_in_only_some_frames_is_no_fault():
-    motion, tilt = motions(DRIVE.cameras(1), [0])[0], Tilt(0, np.array([0, -1.0, 0]), "camera")
     for slopes in ((15.0, 15.0), (-15.0,), (29.0, 18.0)):
         stage = Running(CheckTilt())
-        health = [stage(motion, tilt, Mount(0, np.eye(3)), ground(slope)) for slope in slopes][-1]
+        *_, health = (stage(*STANDING, ground(slope)) for slope in slopes)
         assert (health.fault, stage.finding().severity) == ("", Severity.NOTE)
 
 
 def test_motion_proves_a_tilt_sound_on_a_hillside_of_25_degrees():
-    stage, mount = Running(CheckTilt()), Mount(0, DRIVE.mount)
-    for motion, up in zip(motions(DRIVE.cameras(), DRIVE.stamps()), DRIVE.ups(), strict=True):
-        level = Rotation.align_vectors([mount.camera_from_inclinometer @ up], [[0, -1.0, 0]])[0].as_matrix()
-        hill = ground(25.0)
-        stage(motion, Tilt(motion.stamp, up), mount, replace(hill, points=(hill.points @ level.T).astype(np.float32)))
+    stage, hill = Running(CheckTilt()), ground(25.0)
+    for motion, tilt in readings(DRIVE):
+        level = Rotation.align_vectors([DRIVE.mount @ tilt.up], [[0, -1.0, 0]])[0].as_matrix()
+        stage(motion, tilt, MOUNT, replace(hill, points=(hill.points @ level.T).astype(np.float32)))
     assert stage.finding().severity is Severity.NOTE
     assert stage.finding().sentence.startswith("Tilt and camera agree to 0.")
 
 
 def test_an_empty_cloud_has_no_ground():
-    motion, nothing = motions(DRIVE.cameras(1), [0])[0], np.zeros((0, 3), np.float32)
-    empty = PointCloud(
-        0, nothing, np.zeros((0, 3), np.uint8), np.zeros(0, np.float32), np.zeros(0, np.int32), "camera"
-    )  # fmt: skip
-    health = Running(CheckTilt())(motion, Tilt(0, np.array([0, -1.0, 0])), Mount(0, np.eye(3)), empty)
-    assert np.isnan(health.ground)
+    empty = cloud_of(np.zeros((0, 3)), frame_id="camera")
+    assert np.isnan(Running(CheckTilt())(*STANDING, empty).ground)
