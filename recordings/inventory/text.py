@@ -11,7 +11,6 @@ from recordings.containers.time_range import MAX_LATENESS_NS
 from recordings.inventory.search_range import ROCK
 from recordings.source.cameras import CAMERAS
 
-PAIRED_SHARE = 0.9  # of the images of the camera with fewer of them, that have a partner; fewer are unusual
 MAX_TILT_DELAY = 0.9  # s; a run waits one second for a tilt by default (tilt.patience)
 
 
@@ -60,8 +59,8 @@ def format_description(description: dict[str, Any]) -> str:
 
 def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
     """What is unusual about the stamps, a sentence each, with the setting for it."""
-    offset, fewer = frames["pair_offset_s"], min(frames["left"], frames["right"])
-    if offset is not None and frames["pairs"] < PAIRED_SHARE * fewer:
+    offset = frames["pair_offset_s"]
+    if offset is not None and offset > frames["slop_s"]:
         remedy = f"if they are taken at one time, --set stereo.slop={math.ceil(offset * 1e3)}ms pairs most of them"
         yield f"the stamps of left and right images differ by up to {offset * 1e3:.3g} ms; {remedy}"
     late = (frames["tilt_delay_s"] or 0) - (frames["delay_s"] or [0, 0])[1]

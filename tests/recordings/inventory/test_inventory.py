@@ -113,6 +113,7 @@ def test_images_of_a_second_camera_on_a_topic_are_not_usable(tmp_path, monkeypat
     path = write_sample(tmp_path / "log.mcap", changed(INFOS[0], {"k": lambda k: k * np.geomspace(1, 2, 9)}, [1, 3]))
     described = inventory_of(path)
     assert (described["frames"]["left"], described["frames"]["pairs"]) == (FRAMES, FRAMES - 2)
+    assert "doubtful" not in format_description(described)
     (damage,) = described["damage"]
     why = "the calibration differs from the log's first one, so the image cannot be used"
     assert damage.startswith(f"2 similar, first: {LEFT} at {START + PERIOD} ns: {why}; cut the log in two where it ")
