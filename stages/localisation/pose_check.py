@@ -18,6 +18,7 @@ MIN_STEPS = 5
 MIN_STEP = 0.02  # m; shorter steps are mostly noise
 MAX_DIFFERENCE_SHARE = 0.3  # of a step
 MAX_SCALE_ERROR = 0.05  # share by which three of four steps may be longer by the images than in the log
+MAX_SCALE = 3.0  # of the images' steps over logged ones; beyond it the logged pose stands still
 MIN_SCALED_STEPS = 10  # for a comparison of the scales
 MIN_JUMP = 0.5  # m, and
 MIN_JUMP_RATIO = 10.0  # over the median difference
@@ -47,6 +48,8 @@ class PoseCheck:
         if len(self.steps) < MIN_STEPS:
             return ""
         visual, logged, difference = np.array(self.steps).T
+        if scale := _scale_problem(visual, logged):
+            return scale
         usual = float(np.median(difference))
         step = max(float(np.median(visual)), float(np.median(logged)))
         if step > MIN_STEP and usual > MAX_DIFFERENCE_SHARE * step:
@@ -55,8 +58,6 @@ class PoseCheck:
                 f"{np.median(visual):.2f} m, difference {usual:.2f} m ({len(difference)} steps). Check its frame, its "
                 "heading and its unit, or set source.odometry to none: visual odometry then supplies the pose."
             )
-        if scale := _scale_problem(visual, logged):
-            return scale
         jumps = difference[(difference > MIN_JUMP) & (difference > MIN_JUMP_RATIO * usual)]
         if len(jumps):
             times = counted(len(jumps), "time")
@@ -67,7 +68,7 @@ class PoseCheck:
 def _scale_problem(visual: Array, logged: Array) -> str:
     """What makes most steps of the images, m, longer than the logged ones; empty if they are not."""
     shares = visual[logged > MIN_STEP] / logged[logged > MIN_STEP]
-    if len(shares) < MIN_SCALED_STEPS or np.quantile(shares, 0.25) < 1 + MAX_SCALE_ERROR:
+    if len(shares) < MIN_SCALED_STEPS or not 1 + MAX_SCALE_ERROR <= np.quantile(shares, 0.25) <= MAX_SCALE:
         return ""
     return (
         f"Steps of visual odometry are {100 * (np.median(shares) - 1):.0f} % longer than those of the logged odometry "

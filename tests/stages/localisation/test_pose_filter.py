@@ -148,6 +148,7 @@ def askew(number, pose):
     (lambda number, pose: replace(pose, position=1.1 * pose.position), None),  # slip
     (lambda number, pose: replace(pose, position=pose.position / 1.1),
      r"are 10 % longer than those of the logged odometry \(\d\d steps\), which slip does not explain"),
+    (lambda number, pose: replace(pose, position=pose.position / 2), r"are \d\d+ % longer than those of the logged"),
     (lambda number, pose: replace(pose, position=np.zeros(3)),
      r"disagrees with visual odometry: median step 0\.0\d m vs 0\.\d\d m"),
     (askew, "disagrees with visual odometry"),
