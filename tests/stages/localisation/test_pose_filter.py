@@ -154,7 +154,7 @@ def askew(number, pose):
     (askew, "disagrees with visual odometry"),
     (lambda number, pose: replace(pose, position=pose.position + 5.0 * (number > 9)),
      r"jumps 1 time relative to visual odometry, by up to 8\.\d m"),
-], ids=["alike", "longer", "shorter", "frozen", "askew", "leaping"])  # fmt: skip
+], ids=["alike", "longer", "shorter", "half", "frozen", "askew", "leaping"])  # fmt: skip
 def test_a_logged_pose_that_disagrees_with_the_images_is_a_warning(change, sentence, based):
     stage, mount = Running(PoseFilter()), mount_of(DRIVE, based)
     for number, pose in enumerate(located(DRIVE, Running(PoseFilter()), based)):
