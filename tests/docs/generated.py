@@ -13,21 +13,11 @@ from flow.cli.main import parser
 from flow.config.reference import NodeReference, data_types, stage_reference
 
 DOCS = Path(__file__).parent.parent.parent / "docs"
-STEPS = {
-    "rectification": "Rectification",
-    "matching": "Matching",
-    "refinement": "Refinement",
-    "cloud": "Cloud",
-    "terrain": "Terrain",
-    "localisation": "Localisation",
-}
+STEPS = ("rectification", "matching", "refinement", "cloud", "terrain", "localisation")  # folders of stages
+SETTINGS = "[logs.md](logs.md#settings-of-the-source) describes the settings of the source."
 OTHERS = (
     ("Alignment", "Aligners join streams of different clocks before any stage runs.", "flow.align."),
-    (
-        "Source and sinks",
-        "[logs.md](logs.md#settings-of-the-source) describes the settings of the source.",
-        "recordings.",
-    ),
+    ("Source and sinks", SETTINGS, "recordings."),
 )
 UNITS = {"ns": "s, ms", "rad": "rad, deg"}
 STAGES_INTRO = """# Stages and their parameters
@@ -60,8 +50,8 @@ def pages() -> dict[str, str]:
 def _stages() -> str:
     nodes = stage_reference()
     parts = [STAGES_INTRO]
-    for folder, title in STEPS.items():
-        parts.append(f"## {title}\n")
+    for folder in STEPS:
+        parts.append(f"## {folder.capitalize()}\n")
         for node in sorted(nodes, key=lambda node: node.use):
             if node.use.startswith("stages.") and _folder(node) == folder:
                 parts += _section(node)

@@ -113,11 +113,8 @@ def test_a_worker_that_is_killed_again_and_again_loses_no_log(home, tmp_path):
     fleet = until(command(home, out, "--processes", 2), "12 logs")
     assert fleet.stdout is not None
     for line in fleet.stdout:  # one more log has ended
-        workers = [
-            child
-            for child in psutil.Process(fleet.pid).children(recursive=True)
-            if "spawn_main" in " ".join(child.cmdline())
-        ]
+        children = psutil.Process(fleet.pid).children(recursive=True)
+        workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
         # A log is set aside when its worker has died four times.
         if workers and killed < 3 and " of 12: " in line:
             workers[killed % len(workers)].kill()

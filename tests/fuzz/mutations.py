@@ -6,6 +6,7 @@ import io
 import re
 import struct
 from collections.abc import Callable
+from functools import partial
 from random import Random
 
 from mcap.reader import make_reader
@@ -103,17 +104,8 @@ def mutated_text(chance: Random, content: bytes) -> bytes:
     return text.encode()
 
 
-def mutated_messages(chance: Random, content: bytes) -> bytes:
-    """A log whose messages are changed, in a sound MCAP file."""
-    return _rewritten(chance, content, messages=True)
-
-
-def mutated_schemas(chance: Random, content: bytes) -> bytes:
-    """A log whose schemas, topics and encodings are changed, in a sound MCAP file."""
-    return _rewritten(chance, content, messages=False)
-
-
 def _rewritten(chance: Random, content: bytes, messages: bool) -> bytes:
+    """A sound MCAP file whose messages are changed, or its schemas, topics and encodings."""
     out = io.BytesIO()
     writer, known = Writer(out, compression=CompressionType.NONE), dict[int, int]()
     writer.start()
@@ -133,6 +125,9 @@ def _rewritten(chance: Random, content: bytes, messages: bool) -> bytes:
         writer.add_message(known[channel.id], times[0], data, times[1])
     writer.finish()
     return out.getvalue()
+
+
+mutated_messages, mutated_schemas = (partial(_rewritten, messages=which) for which in (True, False))
 
 
 def _head_first(chance: Random, data: bytes) -> bytes:

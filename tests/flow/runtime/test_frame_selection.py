@@ -28,11 +28,9 @@ def test_every_third_frame_has_the_results_of_a_run_of_all(tmp_path):
 
 def test_a_frame_that_is_left_out_cannot_be_lost(tmp_path):
     """Frame 3 cannot be paired, and the last frame has no level."""
-    events = [
-        (at, name, Number(at, -1.0) if (at, name) == (300 * MS, "left") else item)
-        for at, name, item in traverse(6)
-        if at <= 500 * MS
-    ]
+    events = [event for event in traverse(6) if event[0] <= 500 * MS and event[:2] != (300 * MS, "left")]
+    events.append((300 * MS, "left", Number(300 * MS, -1.0)))
+    events.sort(key=lambda event: event[0])
     assert replayed(graph(tmp_path), events)[1]["drops"] == {"failed": 1, "unaligned": 1}
     _, summary = replayed(graph(tmp_path), events, every=Every(frames=2))
     assert (summary["drops"], summary["frames_left_out"]) == ({}, 3)

@@ -26,10 +26,10 @@ def test_a_page_shows_by_how_much_and_where_a_disparity_is_wrong():
 
 
 def test_each_variant_has_a_page_of_each_frame_with_truth(traverse, fast_result):
-    estimates, truths = (
-        {stamp_of(message.header): read_disparity(message) for _, _, message in iter_decoded(path, [topic])}
-        for path, topic in ((fast_result, "/nav/disparity"), (traverse, "/truth/disparity"))
-    )
+    def disparities(log, topic):
+        return {stamp_of(each.header): read_disparity(each) for _, _, each in iter_decoded(log, [topic])}
+
+    estimates, truths = disparities(fast_result, "/nav/disparity"), disparities(traverse, "/truth/disparity")
     pages = list(error_pages({"A": fast_result, "B": fast_result}, [traverse]))
     assert [label for label, _, _ in pages] == ["A"] * len(estimates) + ["B"] * len(estimates)
     expected = {stamp: error_page(estimates[stamp], truths[stamp]) for stamp in estimates}

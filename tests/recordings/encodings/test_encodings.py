@@ -80,11 +80,8 @@ def protobuf_angles(path: Path, seconds: int, nanoseconds: int, pitch: float) ->
 
 def tilts_of(log: Path) -> list[Any]:
     """The tilts of a log with the fields body.pitch and body.roll."""
-    field = {"unit": "deg", "sign": 1}
-    source = McapSource(
-        inclinometer="/tilt", tilt_model="axis",
-        pitch=AngleField(field="body.pitch", **field), roll=AngleField(field="body.roll", **field),
-    )  # fmt: skip
+    pitch, roll = (AngleField(field=f"body.{angle}", unit="deg", sign=1) for angle in ("pitch", "roll"))
+    source = McapSource(inclinometer="/tilt", tilt_model="axis", pitch=pitch, roll=roll)
     return [item for _, _, item in items_of(log, source)]
 
 
@@ -192,14 +189,11 @@ def png_head(width: int, height: int) -> bytes:
 def test_an_image_bomb_is_refused_before_it_is_decoded():
     message = image(0, "camera", np.zeros((4, 6), np.uint8))
     message.height, message.width = 30_000, 30_000
-    with pytest.raises(LogError, match="the image is 30000x30000, more than 'max_pixels' of the source"):
-        pixels_of(message)
-    compressed = make(
-        "sensor_msgs/msg/CompressedImage", header=message.header, format="png",
-        data=np.frombuffer(png_head(30_000, 30_000), np.uint8),
-    )  # fmt: skip
-    with pytest.raises(LogError, match="the image is 30000x30000, more than 'max_pixels' of the source"):
-        pixels_of(compressed)
+    data = np.frombuffer(png_head(30_000, 30_000), np.uint8)
+    packed = make("sensor_msgs/msg/CompressedImage", header=message.header, format="png", data=data)
+    for bomb in (message, packed):
+        with pytest.raises(LogError, match="the image is 30000x30000, more than 'max_pixels' of the source"):
+            pixels_of(bomb)
 
 
 def test_a_picture_of_many_scans_is_refused_before_it_is_decoded():

@@ -171,19 +171,12 @@ def test_rows_of_a_real_sequence_differ_by_less_than_a_tenth_of_a_pixel_as_by_op
     place = models[1].r.T @ [[-frames[0].camera.baseline], [0.0], [0.0]]
     first, second = ((model.k, model.d[:4]) for model in models)
     solved = cv2.stereoRectify(*first, *second, size, turn, place, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0)
-    maps = [
-        cv2.initUndistortRectifyMap(*model, r, p, size, cv2.CV_32FC1)
-        for model, r, p in zip((first, second), solved[:2], solved[2:4], strict=True)
-    ]
+    lenses = zip((first, second), solved[:2], solved[2:4], strict=True)
+    maps = [cv2.initUndistortRectifyMap(*model, r, p, size, cv2.CV_32FC1) for model, r, p in lenses]
     rectify = Rectify(row_offset=0.0, columns=0)
     ours = [(frame.left, frame.right) for frame in map(rectify, frames)]
-    theirs = [
-        [
-            cv2.remap(image, *tables, cv2.INTER_LINEAR)
-            for image, tables in zip((frame.left, frame.right), maps, strict=True)
-        ]
-        for frame in frames
-    ]
+    pairs = [((frame.left, maps[0]), (frame.right, maps[1])) for frame in frames]
+    theirs = [[cv2.remap(image, *tables, cv2.INTER_LINEAR) for image, tables in pair] for pair in pairs]
     fields = [offset_field(measure(pairs).terms, *size) for pairs in (ours, theirs)]
     assert np.sqrt(np.mean(fields[0] ** 2)) < 0.1
     assert np.sqrt(np.mean((fields[0] - fields[1]) ** 2)) < 0.03

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -63,18 +62,17 @@ def solid(rocks: terrain.Rocks, facets: np.ndarray, index: int, points: np.ndarr
 
 def test_true_disparity_reprojects_to_a_mm_of_the_true_surface(seen):
     points, v, u = world_points(seen)
-    ground = seen.surface[v, u] == raycast.GROUND
-    height = SMALL.terrain.elevation(points[ground, 0], points[ground, 1])
-    assert ground.sum() > 40_000
-    assert np.abs(height - points[ground, 2]).max() < 1e-3
+    bare = seen.surface[v, u] == raycast.GROUND
+    height = SMALL.terrain.elevation(points[bare, 0], points[bare, 1])
+    assert bare.sum() > 40_000
+    assert np.abs(height - points[bare, 2]).max() < 1e-3
     on_rock = seen.surface[v, u]
     rocks = np.unique(on_rock[on_rock >= 0])
     assert len(rocks) > 50
+    ground = SMALL.terrain
     for rock in rocks:
-        excess = solid(
-            SMALL.terrain.rocks, SMALL.terrain.facets, rock, points[on_rock == rock], SMALL.terrain.extent
-        )  # fmt: skip
-        assert np.abs(excess).max() * SMALL.terrain.rocks.semi_axes[rock].max() < 1e-3
+        excess = solid(ground.rocks, ground.facets, rock, points[on_rock == rock], ground.extent)
+        assert np.abs(excess).max() * ground.rocks.semi_axes[rock].max() < 1e-3
 
 
 def test_no_surface_lies_before_the_hits_of_the_rays(seen):
@@ -335,18 +333,16 @@ def test_odometry_has_the_scale_error_and_heading_drift_of_its_settings():
 
 def test_odometry_does_not_drift_while_the_rover_stands():
     still = [Transform("world", "base_link", np.eye(3), np.zeros(3))] * 50
-    poses = dead_reckoning(range(50), still, np.zeros(50), 0.02, 0.1, np.random.default_rng(0))
-    assert all(np.array_equal(pose.position, poses[0].position) for pose in poses)
-    assert all(np.array_equal(pose.quaternion, poses[0].quaternion) for pose in poses)
+    first, *poses = dead_reckoning(range(50), still, np.zeros(50), 0.02, 0.1, np.random.default_rng(0))
+    for pose in poses:
+        np.testing.assert_array_equal([*pose.position, *pose.quaternion], [*first.position, *first.quaternion])
 
 
-def test_the_number_of_threads_does_not_change_the_log(tmp_path: Path):
-    written = []
-    for name, threads in (("a", 1), ("b", 3)):
-        tile = {"relief_cells": 256, "map_half_width": 1.0}
-        write_log(Simulation(frames=1, width=96, height=72, threads=threads, **tile), tmp_path / name)
-        written.append((tmp_path / name).read_bytes())
-    assert written[0] == written[1]
+def test_the_number_of_threads_does_not_change_the_log(tmp_path):
+    tile = Simulation(frames=1, width=96, height=72, relief_cells=256, map_half_width=1.0)
+    for threads in (1, 3):
+        write_log(replace(tile, threads=threads), tmp_path / f"{threads}.mcap")
+    assert (tmp_path / "1.mcap").read_bytes() == (tmp_path / "3.mcap").read_bytes()
 
 
 @pytest.mark.slow
@@ -363,11 +359,12 @@ def test_a_log_of_any_seed_has_stamps_that_can_be_written(seed):
     assert start != Simulation(seed=seed + 1).start
 
 
-def test_an_impossible_simulation_is_refused_with_the_parameters_name():
-    with pytest.raises(ValueError, match="relief_cells must be a power of two"):
-        Simulation(relief_cells=1000)
-    with pytest.raises(ValueError, match="frames must be at least 1, not 0"):
-        Simulation(frames=0)
+@pytest.mark.parametrize(("name", "value", "why"), [
+    ("relief_cells", 1000, "must be a power of two"), ("frames", 0, "must be at least 1, not 0"),
+])  # fmt: skip
+def test_an_impossible_simulation_is_refused_with_the_parameters_name(name, value, why):
+    with pytest.raises(ValueError, match=f"{name} {why}"):
+        Simulation(**{name: value})
 
 
 def rotation(quaternion) -> np.ndarray:

@@ -63,12 +63,12 @@ def test_the_difference_shows_wrong_disparities_and_no_exposure(deep, color, tmp
 
 
 def test_the_confidence_of_the_match_is_drawn_beside_that_of_the_result(tmp_path):
-    items = scene()
-    for stream, share in (("matched", 0.4), ("disparity", 0.9)):
-        confidence = np.full_like(items[stream].confidence, share)
+    items, shares = scene(), {"matched": 40, "disparity": 90}
+    for stream, percent in shares.items():
+        confidence = np.full_like(items[stream].confidence, percent / 100)
         items[stream] = replace(items[stream], confidence=confidence)
     path = record_of(tmp_path / "run.rrd", [Record(START, items)])
-    for stream, percent in (("matched", 40), ("disparity", 90)):
+    for stream, percent in shares.items():
         shown = np.frombuffer(bytes(rows(path, f"/{stream}/confidence", "DepthImage:buffer")[0][2][0]), np.uint8)
         assert set(shown) == {0, percent}  # 0 is unknown
 
@@ -252,10 +252,8 @@ def test_scalars_are_those_of_the_frame(rrd):
 
 
 def test_curves_of_one_plot_differ_in_colour(rrd):
-    names = [
-        *(f"/tilt/inclinometer {axis} up" for axis in "xy"),
-        *("/points/camera " + way for way in ("pitch down", "roll right")),
-    ]
+    names = [f"/tilt/inclinometer {axis} up" for axis in "xy"]
+    names += [f"/points/camera {way}" for way in ("pitch down", "roll right")]
     escaped = ["/".join(map(rr.escape_entity_path_part, name.split("/"))) for name in names]
     colours = [rows(rrd, name, "SeriesLines:colors") for name in escaped]
     assert [len(found) for found in colours] == [1] * 4  # once, for all frames

@@ -52,7 +52,7 @@ def test_every_intermediate_is_recorded_and_the_recording_passes_reruns_own_chec
 
 
 def test_entities_have_the_stamp_of_their_frame_in_nanoseconds(rrd):
-    times = [(clock, frame) for clock, frame, _ in rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")]
+    times = [row[:2] for row in rows(rrd, "/disparity/pixels", "EncodedDepthImage:blob")]
     assert times == [(START + n * STEP, n) for n in range(3)]
 
 
@@ -167,13 +167,11 @@ def test_frames_may_come_from_different_threads(tmp_path):
     """rerun sets its clocks per thread; a thread without them logs for all times."""
     sink = opened(tmp_path / "threads.rrd")
     for n in range(4):
-        record = Record(START + n * STEP, scene(START + n * STEP))
-        thread = threading.Thread(target=sink.write, args=(record,))
+        thread = threading.Thread(target=sink.write, args=(Record(START + n * STEP, scene(START + n * STEP)),))
         thread.start()
         thread.join()
     sink.close({"verdict": "COMPLETE"})
-    found = rows(tmp_path / "threads.rrd", "/points/points", "Points3D:positions")
-    times = [(clock, frame) for clock, frame, _ in found]
+    times = [row[:2] for row in rows(tmp_path / "threads.rrd", "/points/points", "Points3D:positions")]
     assert times == [(START + n * STEP, n) for n in range(4)]
 
 
@@ -200,10 +198,9 @@ def test_a_rerun_error_is_raised_and_not_only_a_warning(tmp_path):
 
 
 def test_an_unwritable_end_leaves_no_file(tmp_path):
-    sink = opened(tmp_path / "run.rrd")
-    sink.write(Record(START, scene(START)))
+    lost = [Loss("left", 1 << 63, "source", "unreadable", "gone")]
     with pytest.raises(OverflowError):
-        sink.close({"entries": [Loss("left", 1 << 63, "source", "unreadable", "gone")]})
+        record_of(tmp_path / "run.rrd", [Record(START, scene(START))], {"entries": lost})
     assert not list(tmp_path.iterdir())
 
 
@@ -282,16 +279,15 @@ def test_intermediates_are_drawn_smaller_than_results(tmp_path):
 def test_images_of_every_nth_frame_are_drawn_and_maps_of_all(tmp_path):
     records = [Record(START + n * STEP, scene(START + n * STEP)) for n in range(4)]
     path = record_of(tmp_path / "every.rrd", records, every=2)
-    for entity, component in (
-        ("/rectified/left", "EncodedImage:blob"), ("/disparity/pixels", "EncodedDepthImage:blob"),
-        ("/points/points", "Points3D:positions"), ("/elevation_map/surface", "Mesh3D:vertex_positions"),
+    for frames, entity, component in (
+        ([0, 2], "/rectified/left", "EncodedImage:blob"), ([0, 2], "/disparity/pixels", "EncodedDepthImage:blob"),
+        ([0, 2], "/points/points", "Points3D:positions"),
+        ([0, 2], "/elevation_map/surface", "Mesh3D:vertex_positions"),
+        ([0, 1, 2, 3], "/elevation_map/relief", "EncodedImage:blob"),
+        ([0, 1, 2, 3], "/navigation_map/cells/labels", "SegmentationImage:buffer"),
+        ([0, 1, 2, 3], "/motion/features", "Scalars:scalars"),
     ):  # fmt: skip
-        assert [frame for _, frame, value in rows(path, entity, component) if value] == [0, 2], entity
-    for entity, component in (
-        ("/elevation_map/relief", "EncodedImage:blob"), ("/navigation_map/cells/labels", "SegmentationImage:buffer"),
-        ("/motion/features", "Scalars:scalars"),
-    ):  # fmt: skip
-        assert [frame for _, frame, value in rows(path, entity, component) if value] == [0, 1, 2, 3], entity
+        assert [frame for _, frame, value in rows(path, entity, component) if value] == frames, entity
     assert "2 of 4" in rows(path, "/summary", "TextDocument:text")[-1][2][0]
 
 

@@ -57,12 +57,10 @@ def test_terrain_and_images_have_colours(messages):
 
 def test_maps_are_offered_to_late_subscribers(result):
     with Reader(result) as reader:
-        durability = {
-            connection.topic: [offered.durability for offered in connection.ext.offered_qos_profiles]
-            for connection in reader.connections
-        }
-    maps = {topic for topic, offered in durability.items() if offered == [QosDurability.TRANSIENT_LOCAL]}
-    assert maps == {topic for topic in durability if "map" in topic}
+        offered = {each.topic: each.ext.offered_qos_profiles for each in reader.connections}
+    for topic, qualities in offered.items():
+        kept = [quality.durability for quality in qualities] == [QosDurability.TRANSIENT_LOCAL]
+        assert kept == ("map" in topic), topic
 
 
 def test_the_tree_of_frames_hangs_from_the_frame_in_which_rerun_draws_a_log(messages):
