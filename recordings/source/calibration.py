@@ -70,6 +70,11 @@ def calibrated_pair(
         raise LogError(
             f"only one of {topics[0]} and {topics[1]} is rectified; set 'left' and 'right' to two of one kind"
         )
+    if abs(right.p[1, 3]) > abs(right.p[0, 3]):
+        raise LogError(
+            f"the camera of {topics[1]} is above or below that of {topics[0]} (P[1,3] is {right.p[1, 3]:.4g}), but "
+            "stereo needs both side by side; rotate the images by 90 degrees before they are calibrated and logged"
+        )
     singles = left.p[0, 3] == 0 and right.p[0, 3] == 0
     right_in_left = _right_in_left(names, tree) if singles else None
     rectified = all(states) and (right_in_left is None or _is_parallel(left, right, right_in_left))

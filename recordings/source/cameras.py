@@ -140,7 +140,7 @@ def _mismatches(
             reasons[side] = (
                 f"the images on {topic} are {pixels.shape[1]}x{pixels.shape[0]}, but the calibration on {info.topic} "
                 f"is for {info.model.width}x{info.model.height} (after binning and region of interest); "
-                f"set '{side}_info' of the source to the matching CameraInfo, or record it"
+                f"set '{side}_info' of the source to the matching CameraInfo, or 'calibration' to its file"
             )
     left, right = (images[side] for side in CAMERAS)
     if reasons or not isinstance(left, np.ndarray) or not isinstance(right, np.ndarray):

@@ -175,7 +175,7 @@ DEEP = {"encoding": "mono16", "step": 2 * WIDTH, "data": lambda data: data[: 2 *
 CROPPED = {"height": HEIGHT - 2, "data": lambda data: data[: 3 * WIDTH * (HEIGHT - 2)]}
 UNLIKE = f"the images on {LEFT} are 24x16 of 8 bit, those on {RIGHT} are 24x16 of 16 bit; record both in one format"
 UNCALIBRATED = f"the images on {LEFT} are 24x14, but the calibration on {INFO} is for 24x16 (after binning and region "
-UNCALIBRATED += "of interest); set 'left_info' of the source to the matching CameraInfo, or record it"
+UNCALIBRATED += "of interest); set 'left_info' of the source to the matching CameraInfo, or 'calibration' to its file"
 
 
 @pytest.mark.parametrize("odd", [range(FRAMES), range(1), range(FRAMES - 1, FRAMES), range(1, FRAMES - 1)])
