@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -68,8 +69,9 @@ def input_beside(result: Path) -> list[Path]:
 
 
 def names_of(logs: Sequence[Path]) -> str:
-    """The name of a log of one or several files, as the facts of a run contain it."""
-    return ", ".join(path.name for path in dict.fromkeys(logs)).encode("utf-8", "replace").decode()
+    """The name of a log of one or several files, as the facts of a run contain it; that of a folder also for "."."""
+    names = (Path(os.path.abspath(path)).name for path in dict.fromkeys(logs))  # noqa: PTH100  # keeps links
+    return ", ".join(names).encode("utf-8", "replace").decode()
 
 
 def part_run(result: Path, logs: Sequence[Path]) -> tuple[float | None, float | None]:

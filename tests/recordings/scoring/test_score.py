@@ -16,6 +16,7 @@ from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.scoring import score as scoring
+from recordings.scoring.result_log import names_of
 from recordings.scoring.stereo_metrics import SURFACES
 from recordings.scoring.table import (
     ROWS,
@@ -366,6 +367,14 @@ def test_a_truth_in_several_files_is_that_of_one(tmp_path, truth, frames):
     whole = scoring.score(run, truth)
     assert whole.frames == 2
     assert scoring.score(run, files).to_json() == scoring.score(run, folder).to_json() == whole.to_json()
+
+
+def test_a_log_has_its_name_also_in_its_own_folder(tmp_path, monkeypatch):
+    (tmp_path / "bag" / "inside").mkdir(parents=True)
+    (tmp_path / "link.mcap").symlink_to("bag")
+    monkeypatch.chdir(tmp_path / "bag" / "inside")
+    assert names_of([Path()]) == "inside"
+    assert names_of([Path(".."), tmp_path / "link.mcap"]) == "bag, link.mcap"
 
 
 def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth, frames):
