@@ -66,7 +66,7 @@ class Pair(Checked):
 
     slop: int = _duration(5_000_000, "largest difference between the two stamps")
     patience: int = _duration(3_000_000_000, "log time to wait for a partner")
-    max_waiting: int = parameter(50, "messages that wait for a partner at once, at most", low=1)
+    max_waiting: int = parameter(50, "largest number of messages that wait for a partner", low=1)
 
     ports = ("left", "right")
     clock = None  # pairs are a clock of their own
@@ -191,7 +191,7 @@ class Interpolate(_Sampler):
         None, "largest time between the two neighbours; none: 1.75 times the stream's interval, at least 200 ms"
     )
     patience: int = _duration(1_000_000_000, "log time to wait for the later neighbour")
-    smooth: int = _duration(0, "samples so near to the stamp are smoothed; 0: interpolate between the two neighbours")
+    smooth: int = _duration(0, "samples this close to the stamp are smoothed; 0: interpolate between two neighbours")
 
     @property
     def reach(self) -> int:
@@ -359,8 +359,8 @@ def _none(name: str, stamp: int, samples: deque[Token], final: str) -> str:
     if not samples:
         return f"no {name} sample{final}"
     if samples[0].stamp > stamp:
-        return f"the first {name} sample is {_time(samples[0].stamp - stamp)} after it"
-    return f"no {name} sample after it{final}; the last is {_time(stamp - samples[-1].stamp)} before it"
+        return f"the first {name} sample is {_time(samples[0].stamp - stamp)} later"
+    return f"no later {name} sample{final}; the last is {_time(stamp - samples[-1].stamp)} earlier"
 
 
 def _paired(name: str, left: Token, right: Token) -> Any:

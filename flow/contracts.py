@@ -23,7 +23,7 @@ class LossReason(StrEnum):
     UNMATCHED = "unmatched"  # no partner for a pair
     UNALIGNED = "unaligned"  # no sample of another clock's stream for the frame
     FAILED = "failed"  # a stage raised an exception
-    ABANDONED = "abandoned"  # the run ended before the frame was through
+    ABANDONED = "abandoned"  # the run ended before the frame was finished
 
 
 class Verdict(StrEnum):
@@ -101,7 +101,7 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about a whole run or log. It is no loss. A fault makes the verdict INCOMPLETE.
+    """One sentence about a whole run or log. It is not a loss. A fault makes the verdict INCOMPLETE.
 
     about: what a fault is in, such as "tilt"; assumes: what a warning takes for sound. A warning whose assumption has a
     fault becomes a note, so that one cause gives one warning.

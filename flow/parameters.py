@@ -109,7 +109,7 @@ def _is_finite(value: Any) -> bool:
 
 
 def coerced(value: Any, kind: Any, known: Field[Any]) -> Any:
-    """A value of a pipeline file as the parameter `known` of type `kind`. Raises ValueError where it is none."""
+    """A value of a pipeline file as the parameter `known` of type `kind`. Raises ValueError for an invalid value."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return None if value is None and NoneType in parts else coerced(value, _option(value, parts), known)

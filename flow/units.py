@@ -33,7 +33,7 @@ _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([A-Za
 
 
 def quantity(text: str, unit: str) -> float:
-    """The value of `text` in `unit`. Raises ValueError if it is no number or measures something else.
+    """The value of `text` in `unit`. Raises ValueError if it is not a number or has another dimension.
 
     >>> quantity("5 ms", "s")
     0.005

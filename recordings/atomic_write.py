@@ -68,7 +68,7 @@ def writing(path: Path) -> Iterator[None]:
 
 def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
     """The error for a file that cannot be written. kept: a note about what was kept."""
-    remedy = "choose another place for the output or make room there"
+    remedy = "choose another folder for the output or free disk space"
     return UnwritableError(f"cannot write {path}: {reason}{kept}; {remedy}")
 
 

@@ -1,4 +1,4 @@
-"""Copies a file that grows into a pipe, in a thread of its own: a slow or suspended reader holds up nobody.
+"""Copies a file that grows into a pipe, in a thread of its own: a slow or suspended reader delays nobody.
 
 The file is the queue between both, so a reader that comes back gets all of it.
 """

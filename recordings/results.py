@@ -53,7 +53,7 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     Raises
     ------
     LogError
-        If the log is no result log or damaged, or has no such stream.
+        If the log is not a result log, is damaged, or has no such stream.
 
     Examples
     --------

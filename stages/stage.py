@@ -60,8 +60,8 @@ def check_cells(what: str, width: float, resolution: float, times: int = 1) -> N
     cells = times * width / resolution
     if cells > MAX_CELLS:
         raise ValueError(
-            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide, and {MAX_CELLS} is "
-            "the most; take larger cells or a smaller map"
+            f"{what} = {width:g} m makes a map {cells:.0f} cells of {resolution:g} m wide; the limit is "
+            f"{MAX_CELLS}; take larger cells or a smaller map"
         )
 
 

@@ -27,7 +27,7 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     for name in ("out", "matched"):
         paths = tmp_path / f"{name}.mcap", tmp_path / f"{name}.json"
         table = said(0, "score", paths[0], "--truth", log, "--json", paths[1]).out
-        words = ("bad-0.5", "bad-4", "only one camera sees", "without the leftmost 32 columns")
+        words = ("bad-0.5", "bad-4", "seen by one camera", "without the leftmost 32 columns")
         assert all(word in table for word in words)
         assert "missing" not in table  # maps without truth
         scores.append(json.loads(paths[1].read_text())["disparity"])
@@ -43,7 +43,7 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
     (None, "Box/im0.png", "is an input of this command"),
     (None, "Box", "is a folder or a device"),
-    (None, "Bex.png", "no input log of roverflow"),
+    (None, "Bex.png", "not a roverflow input log"),
 ])  # fmt: skip
 def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, refused, spoilt, out, words):
     scene = write_scene(tmp_path / "Box")
@@ -60,7 +60,7 @@ def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, refused, spoilt, 
 def test_the_help_of_import_names_its_assumptions(capsys):
     with pytest.raises(SystemExit):
         roverflow("import", "middlebury", "--help")
-    assert "assumes level, 1 m above ground" in " ".join(capsys.readouterr().out.split())
+    assert "assumes a level camera 1 m above ground" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(("given", "lacking"), [

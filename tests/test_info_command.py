@@ -116,7 +116,7 @@ def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
     assert 0.9 * found["ground_px"] < truth < found["range_px"]
     enough = f"--set disparities={found['range_px']:.0f}"
     assert f"{enough} includes it" in said(0, "info", traverse, "--set", "disparities=16").out
-    assert f"fewer than the 192 disparities: {enough} is faster" in said(0, "info", traverse).out
+    assert f"fewer than 192 disparities: {enough} runs faster" in said(0, "info", traverse).out
 
 
 @pytest.mark.parametrize("times", [1, 10, 1000])  # 1000: written in mm
@@ -129,7 +129,7 @@ def test_info_doubts_a_baseline_for_which_no_search_range_is_enough(traverse, tm
     output = said(0, "info", log).out
     assert found["range_px"] <= 1024
     assert bool(found["doubt"]) == (times > 1)
-    doubt = f"reaches beyond 320 px: the baseline of {0.24 * times:g} m, or the height of 0.90 m, looks wrong"
+    doubt = f"ends at 320 px: the baseline of {0.24 * times:g} m, or the height of 0.90 m, looks wrong"
     assert (doubt in output) == (times > 1)
     assert ("--set disparities" in output) == (times == 1)
 

@@ -20,7 +20,7 @@ from tests.recordings.importers.middlebury_scene import write_scene
 
 ROOT = Path(__file__).parent.parent
 OPTIONS = "--help lists the options, and --set STREAM.PARAM=VALUE changes the pipeline"
-TAKEN = "exists and is no {} of roverflow; choose another name or remove it"
+TAKEN = "exists and is not a roverflow {}; choose another name or remove it"
 
 
 def drop(*parts: str):
@@ -72,7 +72,7 @@ def test_a_log_of_another_recorder_is_never_replaced(traverse, tmp_path, refused
             ("simulate", log, "--frames", 1), ("import", "middlebury", scene, log),
         ):  # fmt: skip
             what = TAKEN.format("result log" if command[0] == "run" else "input log")
-            what = "has the name of a log; choose another for a summary" if "--summary" in command else what
+            what = "is named like a log; give the summary another name" if "--summary" in command else what
             assert refused(*command) == f"roverflow: {log} {what}\n"
     assert {path: path.read_bytes() for path in before} == before
     raw.write_bytes(traverse.read_bytes())  # one of our own
@@ -169,7 +169,7 @@ def test_only_a_log_replaces_a_log_or_has_its_name(traverse, tmp_path, refused, 
     log.write_bytes(traverse.read_bytes())
     for name in (log, tmp_path / "new.mcap"):
         kind = option[2:].replace("rrd", "recording")
-        why = "has the name of a log" if name.suffix == ".mcap" else TAKEN.format(kind)
+        why = "is named like a log" if name.suffix == ".mcap" else TAKEN.format(kind)
         assert f"{name} {why}" in refused("run", traverse, "-o", tmp_path / "out.mcap", option, name)
     assert list(tmp_path.iterdir()) == [log]
 
@@ -277,7 +277,7 @@ def test_every_command_reports_an_unwritable_path_alike(traverse, result, tmp_pa
         assert not output  # it is said before the work
         assert "cannot write /proc/x" in printed
         assert printed.count("/proc/x") == 1
-        assert "; choose another place for the output" in printed
+        assert "; choose another folder for the output" in printed
         assert printed.count("\n") == 1
 
 
@@ -317,7 +317,7 @@ def test_angles_of_an_absent_field_are_refused_before_the_run(traverse, tmp_path
     ]
     angles += ["--set=source.tilt_model=axis", f"--set=source.inclinometer={imu}"]
     printed = refused("run", traverse, *angles, "-o", tmp_path / "out.mcap")
-    assert f"the plain angles of {imu}: " in printed
+    assert f"the bare angles of {imu}: " in printed
     assert words in printed
     assert not list(tmp_path.iterdir())
 
@@ -337,8 +337,8 @@ def test_a_pipeline_of_nested_aliases_is_refused_at_once(tmp_path, refused):
 
 @pytest.mark.parametrize(("settings", "printed"), [
     (["max_range=1km"], "stages.Clean.max_range: must be at most 200 m, not 1km"),
-    (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide, and 4000 is the most"),
-    (["regional_cells.max_range=200m"], "makes a map 8000 cells of 0.05 m wide, and 4000 is the most"),
+    (["cells.max_range=100m", "cells.resolution=2cm"], "makes a map 10000 cells of 0.02 m wide; the limit is 4000"),
+    (["regional_cells.max_range=200m"], "makes a map 8000 cells of 0.05 m wide; the limit is 4000"),
     (["regional_elevation.window=400m"], "stages.MapRegion.window: must be at most 200 m, not 400m"),
 ])  # fmt: skip
 def test_maps_beyond_memory_are_refused_before_the_run(settings, printed, refused):
@@ -395,12 +395,12 @@ def test_an_unknown_pipeline_is_answered_with_templates_too(refused):
 def test_an_output_needs_the_ending_of_its_kind(traverse, fast_result, tmp_path, refused):
     out = tmp_path / "out.txt"
     why = refused("run", traverse, "-o", out)
-    assert why.endswith("out.txt is no name of a log; end it in .mcap\n")
+    assert why.endswith("out.txt is not the name of a log; end it in .mcap\n")
     assert refused("simulate", out) == why
-    assert "out.txt is no name of a recording; end it in .rrd" in refused("run", traverse, "--rrd", out)
-    assert "out.txt is no name of a report; end it in .html" in refused("report", fast_result, "-o", out)
+    assert "out.txt is not the name of a recording; end it in .rrd" in refused("run", traverse, "--rrd", out)
+    assert "out.txt is not the name of a report; end it in .html" in refused("report", fast_result, "-o", out)
     why = refused("why", fast_result, "--at", "0", "--cell=2,0", "-o", out)
-    assert "out.txt is no name of a picture; end it in .png" in why
+    assert "out.txt is not the name of a picture; end it in .png" in why
 
 
 def test_a_pair_of_numbers_may_begin_with_a_minus(result, traverse, tmp_path, said):
@@ -414,7 +414,7 @@ def test_a_pair_of_numbers_may_begin_with_a_minus(result, traverse, tmp_path, sa
 def test_a_run_of_python_replaces_no_file_that_no_run_wrote(traverse, tmp_path, monkeypatch, out, rrd, kind):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "log.mcap").write_bytes(traverse.read_bytes())
-    with pytest.raises(SinkError, match=rf"log\.mcap: it exists and is no {kind} of roverflow"):
+    with pytest.raises(SinkError, match=rf"log\.mcap: it exists and is not a roverflow {kind}"):
         replay("log.mcap", "fast", out, rrd, end=1)
     assert (tmp_path / "log.mcap").read_bytes() == traverse.read_bytes()
     assert [file.name for file in tmp_path.iterdir()] == ["log.mcap"]

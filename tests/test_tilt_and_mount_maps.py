@@ -36,7 +36,7 @@ def test_maps_with_an_estimated_tilt_have_at_most_1_5_of_the_errors(tmp_path):
     squares = [np.mean([square for _, square, _ in results]) for results in (exact, estimated)]
     assert np.sqrt(squares[1] / squares[0]) < 1.5
     for _, _, notes in estimated:
-        assert notes["inclinometer"].startswith("up is estimated from the accelerations and rates on /imu/data_raw")
+        assert notes["inclinometer"].startswith("the tilt is estimated from the accelerations and rates on /imu/data")
         assert notes["health"].startswith("Tilt and camera agree")
 
 

@@ -20,7 +20,7 @@ FRAME_BYTES = 100_000  # fewer than a frame of the traverse has in the recording
 
 def test_watching_needs_the_recording(traverse, tmp_path, refused):
     why = refused("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--view")
-    assert "watching needs the recording; leave out --no-rrd" in why
+    assert "--view and --serve need the recording; leave out --no-rrd" in why
 
 
 def check_same(out, result):
@@ -50,7 +50,7 @@ def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, s
     replaced(monkeypatch, lambda command: [sys.executable, "-c", "raise SystemExit(1)"])
     out = tmp_path / "out.mcap"
     printed = said(0, "run", traverse, *SMALL, "-o", out, "--view").out
-    assert f"No viewer (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in printed
+    assert f"No viewer opens (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in printed
     check_same(out, result)
 
 

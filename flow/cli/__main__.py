@@ -8,7 +8,7 @@ from flow.errors import INTERRUPTED
 
 
 def program() -> int:
-    """Run `flow.cli.main.main`; returns its exit code. An interrupt at any moment is no traceback."""
+    """Run `flow.cli.main.main`; returns its exit code. An interrupt at any moment prints no traceback."""
     import gc
     import os
     import signal

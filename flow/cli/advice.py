@@ -121,10 +121,10 @@ def _range_advice(found: Mapping[str, Any] | None, graph: Graph) -> list[str]:
         return []
     enough = f"--set disparities={found['range_px']:.0f}"
     if searched >= AMPLE * found["range_px"]:
-        return [f"  the ground and rocks of {ROCK} m need fewer than the {searched} disparities: {enough} is faster"]
+        return [f"  ground and rocks of {ROCK} m need fewer than {searched} disparities: {enough} runs faster"]
     if found["ground_px"] < searched:
         return []
-    return [f"  the near ground has more disparities than the {searched} searched at full size: {enough} includes it"]
+    return [f"  near ground lies beyond the {searched} disparities searched at full size: {enough} includes it"]
 
 
 def _settings(values: Mapping[str, Any]) -> str:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _MAX_WORKERS = 1024
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
-AT = "seconds after the first message, a time as the viewer shows it, or cursor: that of the open viewer"
+AT = "seconds after the log's first message, a time copied from the viewer, or cursor: the time in the open viewer"
 CURSOR = "cursor"  # the instant of a viewer that is open
 
 

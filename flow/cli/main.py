@@ -122,7 +122,7 @@ def _sentence(error: BaseException, traced: bool) -> str:
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'the output'}: {error.strerror}"
     if "cannot cache function" in str(error):  # numba's own message names neither reason nor remedy
-        return "compiled kernels have no cache folder; set NUMBA_CACHE_DIR to a folder that can be written"
+        return "compiled kernels have no cache folder; set NUMBA_CACHE_DIR to a writable folder"
     return f"internal failure, {type(error).__name__}: {error}{'' if traced else ' (--debug prints the traceback)'}"
 
 
@@ -154,7 +154,7 @@ def parser() -> argparse.ArgumentParser:
     """The parser of the command line; every command declares its own arguments."""
     top = CommandParser(
         prog="roverflow",
-        description="Turn the log of a rover into disparity, point clouds, elevation and navigation maps.",
+        description="Turn a rover's log into disparity, point clouds, elevation maps and navigation maps.",
         epilog="Exit codes: 0 complete; 1 an output or the program failed; 2 wrong usage, or an unusable log; "
         "3 finished but incomplete; 130 interrupted (the outputs of a run are closed and readable).",
     )
@@ -162,7 +162,7 @@ def parser() -> argparse.ArgumentParser:
     commands = top.add_subparsers(required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
         _add(commands, name, command)
-    make = "make a log from other recordings"
+    make = "make a log from a data set or a folder of images"
     kinds = commands.add_parser("import", help=make, description=_titled(make))
     importers = kinds.add_subparsers(required=True, metavar="KIND")
     for name, importer in IMPORTERS.items():
@@ -171,7 +171,8 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add(commands: Any, name: str, command: ModuleType | DataSet) -> None:
-    sub: argparse.ArgumentParser = commands.add_parser(name, help=command.HELP, description=_titled(command.HELP))
+    texts = {"help": command.HELP, "description": _titled(command.HELP), "epilog": "Defaults are in parentheses."}
+    sub: argparse.ArgumentParser = commands.add_parser(name, **texts)
     command.add_arguments(sub)
     sub.add_argument("--debug", action="store_true", help="print tracebacks")
     sub.set_defaults(command=command.run, parser=sub)

@@ -21,7 +21,7 @@ def add_pipeline_options(sub: argparse.ArgumentParser) -> None:
     """Add -p and --set."""
     sub.add_argument("-p", "--pipeline", default="rover", help="rover, fast, accurate, paper, or a YAML file (rover)")
     sub.add_argument(
-        "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter of the pipeline"
+        "--set", action="append", default=[], metavar="STREAM.PARAM=VALUE", help="change a parameter (repeatable)"
     )
 
 
@@ -56,7 +56,7 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
         if path is None:
             continue
         if not path.parent.is_dir():
-            raise UsageError(f"there is no folder {path.parent} for {path.name}; make it first")
+            raise UsageError(f"there is no folder {path.parent} for {path.name}; create it first")
         if path.exists() and not path.is_file():
             raise UsageError(f"{path} is a folder or a device; give the name of a file")
         for given in inputs:
@@ -65,11 +65,11 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
         if (resolved := os.path.realpath(path)) in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
         if path.suffix.lower() == ".mcap" and not kind.endswith("log"):
-            raise UsageError(f"{path} has the name of a log; choose another for a {kind}")
+            raise UsageError(f"{path} is named like a log; give the {kind} another name")
         if path.exists() and not is_ours(path, kind):
-            raise UsageError(f"{path} exists and is no {kind} of roverflow; choose another name or remove it")
+            raise UsageError(f"{path} exists and is not a roverflow {kind}; choose another name or remove it")
         noun = "log" if kind.endswith("log") else kind
         if path.suffix.lower() != (ending := _ENDINGS.get(noun, path.suffix.lower())):
-            raise UsageError(f"{path} is no name of a {noun}; end it in {ending}")
+            raise UsageError(f"{path} is not the name of a {noun}; end it in {ending}")
         check_writable(path)
         taken.append(resolved)

@@ -69,7 +69,7 @@ def by_cause(drops: Mapping[str, int]) -> list[tuple[str, int]]:
 
 def report(summary: dict[str, Any], compiled: bool = False) -> None:
     """Print the summary of a run. compiled: whether it compiled kernels, which lowers its rate."""
-    say(headline(summary) + (" (with compiling kernels)" if compiled else ""))
+    say(headline(summary) + (" (including kernel compilation)" if compiled else ""))
     if summary["frames_left_out"]:
         say(f"  {counted(summary['frames_left_out'], 'frame')} left out by --every {summary['every']}")
     found = [summary["surveys"], summary["findings"]]

@@ -46,11 +46,11 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
 
     def report_failure() -> None:
         if process.wait() > 0:
-            say(f"No viewer (no display?). The run goes on; afterwards: rerun {recording}")
+            say(f"No viewer opens (no display?). The run goes on; afterwards: rerun {recording}")
 
     reporter = threading.Thread(target=report_failure, name="viewer", daemon=True)
     if serve:
-        say(f"watch the run at http://127.0.0.1:{web}/?url=rerun+http://127.0.0.1:{port}/proxy while it lasts")
+        say(f"watch the run at http://127.0.0.1:{web}/?url=rerun+http://127.0.0.1:{port}/proxy until it ends")
     else:
         reporter.start()
     try:

@@ -74,7 +74,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise UsageError(f"the pipeline {path} is no text; give {', '.join(shipped())} or a YAML file") from error
+        raise UsageError(f"the pipeline {path} is not text; give {', '.join(shipped())} or a YAML file") from error
     except OSError as error:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
 

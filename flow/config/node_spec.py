@@ -130,11 +130,11 @@ def class_at(use: str, place: YamlLocation) -> type:
     if isinstance(kind, type) and is_dataclass(kind):
         if any(isinstance(value, Field) for value in vars(kind).values()):  # a base is a dataclass
             frozen = "(frozen=True)" * kind.__dataclass_params__.frozen  # type: ignore[attr-defined]
-            raise place.error(f"{use} has parameters, but is no dataclass; decorate it with @dataclass{frozen}")
+            raise place.error(f"{use} has parameters, but is not a dataclass; decorate it with @dataclass{frozen}")
         return kind
     if hasattr(module, name):
         remedy = "decorate it with @dataclass" if isinstance(kind, type) else "a stage is a class with __call__"
-        raise place.error(f"{use} is no dataclass; {remedy}")
+        raise place.error(f"{use} is not a dataclass; {remedy}")
     listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
     known = [n for n in listed if is_dataclass(getattr(module, n, None))]
     raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known)}")

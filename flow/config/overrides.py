@@ -63,9 +63,9 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
     used = {leaf.value for key, item in tree.value.items() if key != "templates" for leaf in item.leaves()}
     for name, item in given.items():
         if any(str(leaf.value).startswith("$") for leaf in settings[name].leaves()):
-            raise settings[name].place.error(f"the setting '{name}' refers to another setting; give it a value")
+            raise settings[name].place.error(f"the setting '{name}' refers to another setting; set it to a value")
         if f"${name}" not in used:
-            raise item.place.error(f"the setting '{name}' is used nowhere; write ${name} where it belongs")
+            raise item.place.error(f"the setting '{name}' is not used; write ${name} to use it")
     for change in (_filled(change, settings) for change in of_parts):
         if change.target == "source":
             filled["source"] = change.applied(filled["source"])

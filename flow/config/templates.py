@@ -46,7 +46,7 @@ class Template:
         )
         if template.output not in template.streams:
             meant = nearest(template.output, template.streams)
-            raise given["output"].place.error(f"the output '{template.output}' is no stream of '{name}'{meant}")
+            raise given["output"].place.error(f"the output '{template.output}' is not a stream of '{name}'{meant}")
         template._check_names()
         return template
 
@@ -65,9 +65,9 @@ class Template:
                 raise place.error(f"template '{self.name}' has no parameter '{key}'{nearest(key, self.parameters)}")
         for key, item in self.parameters.items():
             if key in (*self.inputs, "use", "template", "optional"):
-                raise item.place.error(f"'{key}' is no name of a parameter of '{self.name}'; choose another name")
+                raise item.place.error(f"'{key}' cannot name a parameter of '{self.name}'; choose another name")
             if key not in uses:
-                raise item.place.error(f"the parameter '{key}' of '{self.name}' is used nowhere; write ${key} for it")
+                raise item.place.error(f"the parameter '{key}' of '{self.name}' is not used; write ${key} to use it")
 
 
 @dataclass(frozen=True)
@@ -106,9 +106,9 @@ class StreamSpec:
 def check_name(name: str, place: YamlLocation) -> None:
     """Refuse a name that no stream can have."""
     if not (name.isascii() and name.isidentifier()):
-        raise place.error(f"'{name}' is no name of a stream; letters, digits and underscores make one, no digit first")
+        raise place.error(f"'{name}' cannot name a stream; use letters, digits and underscores, no digit first")
     if name == "source":
-        raise place.error("'source' is no name of a stream: settings of the source go by it")
+        raise place.error("'source' cannot name a stream, because it names the settings of the source")
 
 
 class Library:
@@ -134,7 +134,7 @@ class Library:
     def _read(self, name: Value) -> Template:
         parts = {file.stem: file for file in (SHIPPED / "parts").glob("*.yaml")}
         if name.value not in parts:
-            meant = nearest(name.value, [*self._known, *parts]) or "; write it under 'templates' of the pipeline file"
+            meant = nearest(name.value, [*self._known, *parts]) or "; write it under 'templates' in the pipeline file"
             raise name.place.error(f"there is no template '{name.value}'{meant}")
         shown, text = f"parts/{name.value}.yaml", parts[name.value].read_text(encoding="utf-8")
         self._texts[shown] = text
@@ -233,7 +233,7 @@ def _is_use(item: Value) -> bool:
     if not isinstance(item.value, dict) or "template" not in item.value:
         return False
     if "use" in item.value:
-        raise item.place.error("an entry has 'use' or 'template', not both")
+        raise item.place.error("an entry must have 'use' or 'template', not both")
     return True
 
 

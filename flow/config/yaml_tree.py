@@ -78,7 +78,7 @@ def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.Sa
             key, key_place = key_node.value, at(key_node.start_mark.line + 1)
             if key_node.tag != "tag:yaml.org,2002:str":
                 shown = f"'{key}'" if isinstance(key, str) else "a list or a mapping"
-                raise key_place.error(f"{shown} is no name; a name is text, quoted where YAML reads something else")
+                raise key_place.error(f"{shown} is not a name; write text, quoted where YAML reads something else")
             if key in mapping:
                 raise key_place.error(f"'{key}' is here twice")
             mapping[key] = Value(_located(value_node, at, loader).value, key_place)

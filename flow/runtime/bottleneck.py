@@ -45,11 +45,11 @@ def _another_worker(busy: float, serial: Mapping[str, float], workers: int, core
     longest = max(serial, key=lambda name: serial[name])
     bound = serial[longest]
     if workers >= cores:
-        return f"another worker would bring nothing, because each of the {cores} cores has one"
+        return f"another worker would not help, because each of the {cores} cores has one"
     gain = max(busy / workers, bound) / max(busy / (workers + 1), bound)
     if gain < MIN_GAIN:
-        return f"another worker would bring nothing, because {_shown(longest)} takes one frame at a time"
-    return f"another worker would bring up to {gain - 1:.0%} more frames/s"
+        return f"another worker would not help, because {_shown(longest)} takes one frame at a time"
+    return f"another worker would give up to {gain - 1:.0%} more frames/s"
 
 
 def usable_cores() -> int:

@@ -178,7 +178,7 @@ class Engine:
         with self._condition:
             self._over = True
             for frame in self._frames:
-                detail = "the run ended before the frame was through"
+                detail = "the run ended before the frame was finished"
                 entry = self._ledger.add(Loss("frame", frame.stamp, "engine", LossReason.ABANDONED, detail))
                 self.late_entries += [*frame.entries, entry]
 

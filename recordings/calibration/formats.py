@@ -65,7 +65,7 @@ class StereoCalibration:
 
 
 def read_calibration(paths: Sequence[Path]) -> StereoCalibration:
-    """The calibration in one to three files. Raises LogError for files that are none."""
+    """The calibration in one to three files. Raises LogError for other files."""
     named = [(str(path), read_yaml(path)) for path in paths]
     where, all_keys = " and ".join(name for name, _ in named), {key for _, content in named for key in content}
     if {"cam0", "cam1"} <= all_keys:
@@ -78,7 +78,7 @@ def read_calibration(paths: Sequence[Path]) -> StereoCalibration:
     elif len(named) == 2 and all({"projection_matrix", "P", "p"} & content.keys() for _, content in named):
         made = _ros(named)
     elif "T_BS" in all_keys or {"projection_matrix", "P", "p"} & all_keys:
-        raise LogError(f"{where} is the calibration of one camera; give a list of the left and the right one's file")
+        raise LogError(f"{where} is the calibration of one camera; give a list of two files, left first")
     else:
         made = _opencv(named, where)
     for model, side in zip(made.models, ("left", "right"), strict=True):
@@ -87,7 +87,7 @@ def read_calibration(paths: Sequence[Path]) -> StereoCalibration:
     if made.right_in_left is not None:
         baseline = float(np.linalg.norm(made.right_in_left[:3, 3]))
         if not 0 < baseline <= MAX_BASELINE_M:
-            raise LogError(f"the cameras of {where} are {baseline:g} m apart, which is no baseline; write it in metres")
+            raise LogError(f"the cameras of {where} are {baseline:g} m apart, which is not a baseline; give metres")
     return made
 
 
@@ -171,7 +171,7 @@ def _opencv(named: Sequence[tuple[str, Mapping[str, Any]]], where: str) -> Stere
             for name, pairs in _OPENCV_NAMES.items()
         }
         if found["K"] is None or found["D"] is None:
-            raise LogError(f"{where} is no calibration of a known format; give {_KNOWN}")
+            raise LogError(f"{where} is not a calibration in a known format; give {_KNOWN}")
         k = [numbers(whole, name, (3, 3), where) for name in found["K"]]
         d = [numbers(whole, name, (-1,), where) for name in found["D"]]
         sizes = [_opencv_size(whole)] * 2
@@ -209,13 +209,13 @@ def _pinhole(content: Mapping[str, Any], where: str, coefficients: str) -> Camer
 
 
 def _model(content: Mapping[str, Any], where: str, coefficients: int | None = None) -> str:
-    """The lens model by our name."""
+    """The lens model by its name in `CameraModel`."""
     given = str(content.get("distortion_model", "plumb_bob"))
     if given not in _MODELS:
         raise LogError(f"the lens model '{given}' of {where} is not supported, only {', '.join(_MODELS)}")
     model = _MODELS[given]
     if coefficients is not None and coefficients not in _COEFFICIENTS[model]:
-        raise LogError(f"{where} has {coefficients} coefficients of distortion, which is no '{given}'")
+        raise LogError(f"{where} has {coefficients} distortion coefficients, which do not fit '{given}'")
     return model
 
 
@@ -242,7 +242,7 @@ def _check_rigid(matrix: Array, name: str, where: str) -> None:
 def _mapping(content: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
     found = content[name]
     if not isinstance(found, Mapping):
-        raise LogError(f"'{name}' of {where} is not a camera; it must contain names with values")
+        raise LogError(f"'{name}' of {where} is not a camera; it must be a mapping of names to values")
     return found
 
 

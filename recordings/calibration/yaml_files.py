@@ -47,9 +47,9 @@ def read_yaml(path: Path, kind: str = "calibration") -> dict[str, Any]:
             f"the {kind} {path}{where} cannot be read as YAML; correct it, or write it again with its tool"
         ) from error
     if values > MAX_FILE_BYTES:
-        raise LogError(f"the {kind} {path} has more than {MAX_FILE_BYTES} values by its aliases; write it without them")
+        raise LogError(f"the {kind} {path} expands to more than {MAX_FILE_BYTES} values; write it without aliases")
     if not isinstance(content, dict):
-        raise LogError(f"the {kind} {path} contains no names with values; write lines of NAME: VALUE")
+        raise LogError(f"the {kind} {path} is not a mapping; write lines of NAME: VALUE")
     return content
 
 

@@ -108,7 +108,7 @@ def diff(
     Raises
     ------
     LogError
-        If a log cannot be read, or is no result log.
+        If a log cannot be read, or is not a result log.
 
     Examples
     --------

@@ -70,8 +70,8 @@ class BagIndex(Reader):
                         chunk, after = chunk._replace(datasize=size - chunk.datapos), size
                     self.chunks[position] = chunk
             except Exception as error:  # foreign bytes may fail the reader in any way
-                cut = f"is cut or damaged at byte {position} of {size} ({sentence_of(error).rstrip('.')})"
-                return [*lost, f"the bag {cut}; before that it contains {counted(len(self), 'message')}"]
+                cut = f"is truncated or damaged at byte {position} of {size} ({sentence_of(error).rstrip('.')})"
+                return [*lost, f"the bag {cut}; intact before it: {counted(len(self), 'message')}"]
             if operation == RecordType.CHUNK and (why := self._walk_chunk(position, unpacked(position))):
                 lost.append(why)
             position = after

@@ -53,7 +53,7 @@ class Db3File:
                 self.lost.append(LostMessage(None, self.end, self._unwritten.removeprefix("; ")))
         except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:  # a column may have any type
             self.close()
-            raise LogError(f"{path} is no rosbag2 recording or is damaged ({sentence_of(error)})") from error
+            raise LogError(f"{path} is not a rosbag2 recording or is damaged ({sentence_of(error)})") from error
         except BaseException:
             self.close()
             raise
@@ -132,7 +132,7 @@ class Db3File:
             self._read_rows(columns, 1)  # what an error cut off
         except sqlite3.Error as error:
             held = counted(len(columns[0]), "message")
-            reason = f"the file is cut or damaged ({sentence_of(error)}); before that it contains {held}"
+            reason = f"the file is truncated or damaged ({sentence_of(error)}); intact before it: {held}"
             self.lost.append(LostMessage(None, max(columns[2], default=0), reason))
         found = tuple(np.frombuffer(column, np.int64) for column in columns)
         for number in sorted(set(found[1].tolist()) - self.channels.keys()):

@@ -53,7 +53,7 @@ def find_files(given: Path | str | Sequence[Path | str]) -> FoundFiles:
 
 
 def first_bytes(path: Path, kind: str = "a log") -> bytes:
-    """The first bytes of a file. kind: of the file, for the sentence. Raises LogError for what is none, or empty."""
+    """The first bytes of a file. kind: of the file, for the message. Raises LogError if it is no file, or empty."""
     if path.exists() and not path.is_file():
         what, where = ("a folder", " in it") if path.is_dir() else ("a pipe or a device", "")
         raise LogError(f"{path} is {what}; give {kind}{where}")

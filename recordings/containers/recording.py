@@ -115,8 +115,8 @@ class _Part:
 
 def _repeated(step: ClockStep) -> str:
     return (
-        f"the log's clock and the header stamps were set back by at least {step.fall / 1e9:.3g} s, and it is not yet "
-        "1 s beyond its old time: the times repeat"
+        f"the recorder's clock and the header stamps were set back by at least {step.fall / 1e9:.3g} s: times repeat, "
+        "so messages are lost until the clock is 1 s past its old time"
     )
 
 

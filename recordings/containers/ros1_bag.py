@@ -47,7 +47,7 @@ class Ros1Bag:
             if not len(self._bag):
                 self.close()
                 why = sentence_of(error).rstrip(".").removesuffix(", reindex before reading")
-                raise LogError(f"{path} cannot be read ({why}); record it again, as it shows no messages") from error
+                raise LogError(f"{path} cannot be read ({why}); record it again, as no message is found") from error
         try:
             self.channels = {
                 number: Channel(number, connection.topic, "ros1", _schema(connection))

@@ -15,7 +15,7 @@ _MAX_RATIO = 200  # of a recording's size to its compressed size; more is a host
 
 
 def unpacked(path: Path, stack: ExitStack) -> Path:
-    """The unpacked file; it is deleted when the stack closes. A cut file is unpacked as far as it goes."""
+    """The unpacked file; it is deleted when the stack closes. A truncated file is unpacked as far as possible."""
     folder = Path(stack.enter_context(TemporaryDirectory(prefix="roverflow-")))
     out, limit = folder / path.stem, max(path.stat().st_size, _BLOCK_BYTES) * _MAX_RATIO
     try:
@@ -24,7 +24,7 @@ def unpacked(path: Path, stack: ExitStack) -> Path:
             while block := stream.read(_BLOCK_BYTES):
                 file.write(block)
                 if file.tell() > limit:
-                    raise LogError(f"{path} unpacks to more than {_MAX_RATIO} times its size; it is no recording")
+                    raise LogError(f"{path} unpacks to more than {_MAX_RATIO} times its size; it is not a recording")
     except zstandard.ZstdError as error:
         if not out.stat().st_size:
             raise LogError(f"{path} cannot be unpacked ({sentence_of(error)}); copy it again") from error

@@ -33,7 +33,7 @@ class TiltKind(StrEnum):
     """What a tilt is made of."""
 
     ORIENTATION = "orientation"
-    ANGLES = "plain angles"
+    ANGLES = "bare angles"
     ACCELERATIONS = "accelerations"  # each by itself, as of an inclinometer
     ESTIMATE = "estimate"  # from accelerations and rates
     POSE = "pose"

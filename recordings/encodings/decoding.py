@@ -36,7 +36,7 @@ def decoder_of(channel: Channel, unpacking: Unpacking | None = None) -> tuple[st
     """
     schema, encoding = channel.schema, channel.message_encoding
     if encoding not in ENCODINGS:
-        raise LogError(f"its messages are in '{encoding}', which cannot be read; {', '.join(ENCODINGS)} can")
+        raise LogError(f"its messages are in '{encoding}', which is not supported, only {', '.join(ENCODINGS)}")
     if schema is None and encoding != "json":
         raise LogError("its messages have no schema")
     decode, name = _plain_decoder(encoding, schema), "" if schema is None else schema.name

@@ -1,1 +1,1 @@
-"""Results as files that GIS programs, map_server, point cloud viewers and eyes read."""
+"""Results as files for GIS programs, map_server and point cloud viewers, and as pictures."""

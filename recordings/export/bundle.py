@@ -119,8 +119,8 @@ def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:
     }
     for name in maps:
         if name not in streams:
-            only = ", ".join(streams) or "none at all"
-            raise LogError(f"{result} contains no map '{name}', only {only}{nearest(name, streams)}")
+            known = ", ".join(streams) or "none"
+            raise LogError(f"{result} contains no map '{name}'; its maps: {known}{nearest(name, streams)}")
     found = {kind: [name for name in maps if streams[name] == schema] for kind, schema in _SCHEMAS.items()}
     for kind, names in found.items():
         if len(names) > 1:
@@ -317,7 +317,7 @@ def _read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:
     try:
         return reader(message)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise LogError(f"{result}: a {message.__msgtype__} in it is not one: {sentence_of(error)}") from error
+        raise LogError(f"{result}: a {message.__msgtype__} in it is invalid: {sentence_of(error)}") from error
 
 
 def _write(path: Path, write: Callable[..., Any], *arguments: Any) -> Path:

@@ -1,6 +1,6 @@
 """Places a map on the Earth: fixes of a satellite receiver beside the poses give its position and heading in UTM.
 
-Map and grid are both metric, so two shifts and a heading lead from one to the other; the scale is that of the
+Map and grid are both metric, so two shifts and a heading transform one to the other; the scale is that of the
 projection. Heights stay those of the map.
 
 References
@@ -34,7 +34,7 @@ _UTM = re.compile(r"EPSG:32([67])(0[1-9]|[1-5]\d|60)$", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Georeference:
-    """Where a map's frame lies in UTM: (east, north) = scale * turned (x, y) + (east, north) of its origin.
+    """Where a map's frame lies in UTM: (east, north) = scale * rotated (x, y) + (east, north) of its origin.
 
     epsg: code of the zone; heading: of the frame's x axis from grid east to the left, rad; residual: RMS of the fixes,
     m; sigma: standard deviation of the heading, rad.
@@ -70,7 +70,7 @@ def zone_of(crs: str, latitude: float, longitude: float) -> int:
         return (32600 if latitude >= 0 else 32700) + int((longitude + 180) % 360 // 6) + 1
     found = _UTM.match(crs)
     if found is None:
-        raise LogError(f"'{crs}' is no zone of UTM; give utm, or EPSG:32601 to EPSG:32660 or EPSG:32701 to EPSG:32760")
+        raise LogError(f"'{crs}' is not a UTM zone; give utm, or EPSG:32601 to EPSG:32660 or EPSG:32701 to EPSG:32760")
     return int(crs[5:])
 
 
@@ -157,7 +157,7 @@ def _fitted(name: str, poses: Array, stamps: Array, places: Array, epsg: int) ->
     sigma = residual / math.sqrt(2) / spread if spread else math.inf
     if not sigma <= MAX_HEADING_SIGMA:
         raise LogError(
-            f"the fixes leave the heading of '{name}' open: they are {residual:.2f} m off a drive over "
+            f"the fixes do not determine the heading of '{name}': they are {residual:.2f} m off a drive over "
             f"{math.hypot(np.ptp(x), np.ptp(y)):.1f} m; export without --crs, or a longer drive"
         )
     return Georeference(epsg, scale, heading, float(shift[0]), float(shift[1]), residual, sigma, len(stamps))

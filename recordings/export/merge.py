@@ -196,7 +196,7 @@ def _region(result: Path, lost: Counter[str] | None) -> tuple[Mosaic, dict[tuple
     regions = regions_of(result, lost, REGIONAL, colored=False)
     if len(regions) > 1:
         names = ", ".join(regions)
-        raise LogError(f"the regional map of {result} was reset (frames {names}); only a map in one frame is merged")
+        raise LogError(f"the regional map of {result} was reset (frames {names}); merging needs a map in one frame")
     (region,) = regions.values()
     terrain = region.elevation
     if terrain is None or "variance" not in terrain.fills:

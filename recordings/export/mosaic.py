@@ -55,12 +55,12 @@ class Mosaic:
         if not same or abs(resolution / self.resolution - 1) > 1e-6:
             raise LogError(
                 f"the maps of the log differ: {', '.join(layers)} at {resolution:g} m in '{grid.frame_id}' after "
-                f"{', '.join(self.fills)} at {self.resolution:g} m in '{self.frame_id}'; export the parts on their own"
+                f"{', '.join(self.fills)} at {self.resolution:g} m in '{self.frame_id}'; export the parts separately"
             )
         corner = np.array([origin[1], origin[0]]) / self.resolution
         first = np.rint(corner).astype(int)
         if np.abs(corner - first).max() > _MAX_GRID_OFFSET:
-            raise LogError(f"a map begins at {origin} m, which is no whole number of cells of {self.resolution:g} m")
+            raise LogError(f"a map begins at {origin} m, which is not a whole number of cells of {self.resolution:g} m")
         row, col = first.tolist()
         block = self._cells.read(row, col, *known.shape)
         middle = np.zeros(known.shape, bool)

@@ -1,1 +1,1 @@
-"""Other people's data sets, written as logs."""
+"""Public data sets, written as logs."""

@@ -78,7 +78,7 @@ def _pairs(source: Path, stamps: dict[int, int], notes: list[str]) -> list[Image
         else:
             pairs.append(ImagePair(stamp, left, right))
     if without:
-        notes.append(f"{counted(without, 'pair')} left out, as {TIMES} has no time of its number")
+        notes.append(f"{counted(without, 'pair')} left out, as {TIMES} has no time for its number")
     if not pairs:
         raise LogError(f"{source} contains no pair of images with a time in {TIMES}")
     return sorted(pairs, key=lambda pair: pair.stamp)
@@ -88,7 +88,7 @@ def _tilts(folder: Path, rig: Rig, stamps: dict[int, int]) -> list[Logged]:
     """The readings of the inclinometer; those of images without a time are not used."""
     path = next((path for name in (SAMPLED, RAW) if (path := folder / name).exists()), None)
     if path is None:
-        raise LogError(f"there is neither {SAMPLED} nor {RAW} in {folder}; get the logs again")
+        raise LogError(f"there is neither {SAMPLED} nor {RAW} in {folder}; download the logs again")
     columns = rig.pitch_column or 0, rig.roll_column or 0
     signs = np.array([rig.pitch_sign, rig.roll_sign], np.float64) * (np.pi / 180 if rig.angle_unit == "deg" else 1.0)
     found = []

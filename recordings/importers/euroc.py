@@ -51,7 +51,7 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
         if not calibration[0].exists():
             raise LogError(f"there is no {calibration[0]}; give --calibration, such as Kalibr's camchain.yaml")
     notes = [
-        f"{path.name} of {path.parent.name} begins with %YAML:1.0, which is no YAML; the line is ignored"
+        f"{path.name} of {path.parent.name} begins with %YAML:1.0, which is not YAML; the line is ignored"
         for path in calibration if path.is_file() and path.read_bytes().startswith(b"%YAML:")
     ]  # fmt: skip
     calibrated = read_calibration(calibration)

@@ -34,7 +34,7 @@ def read_lines(path: Path) -> Iterator[tuple[str, str]]:
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise LogError(f"{path} is not a text file; get it again") from error
+        raise LogError(f"{path} is not a text file; correct it or get it again") from error
     for number, line in enumerate(text.splitlines(), 1):
         if (content := line.strip()) and content[0] not in "#%":
             yield f"{path}, line {number}", content
@@ -45,7 +45,7 @@ def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterato
     for where, line in read_lines(path):
         row = [value.strip() for value in line.rstrip(f"{separator or ''} ").split(separator)]
         if len(row) < columns:
-            raise LogError(f"{where} has {len(row)} columns, but at least {columns} are needed; get the file again")
+            raise LogError(f"{where} has {len(row)} columns, not at least {columns}; correct it or get it again")
         yield where, row
 
 
@@ -54,16 +54,16 @@ def numbers_of(values: list[str], where: str) -> Array:
     try:
         found = np.array([float(value) for value in values])
     except ValueError as error:
-        raise LogError(f"{where} contains what is no number ({error}); get the file again") from error
+        raise LogError(f"{where} contains what is not a number ({error}); correct it or get it again") from error
     if not np.isfinite(found).all():
-        raise LogError(f"{where} contains a number that is not finite; get the file again")
+        raise LogError(f"{where} contains a number that is not finite; correct it or get it again")
     return found
 
 
 def rotation_of(quaternion: Array, where: str) -> Rotation:
     """The rotation of a quaternion x, y, z, w. Raises LogError unless its length is 1."""
     if not abs((length := float(np.linalg.norm(quaternion))) - 1) <= MAX_ROUNDING:
-        raise LogError(f"{where} has a quaternion of the length {length:g}; get the file again")
+        raise LogError(f"{where} has a quaternion of the length {length:g}; correct it or get it again")
     return Rotation.from_quat(quaternion)
 
 
@@ -71,7 +71,7 @@ def nanoseconds(text: str, where: str) -> int:
     """A stamp in whole nanoseconds. Raises LogError, also for one that a spreadsheet rounded (1.40363E+18)."""
     if not text.isdecimal():
         raise LogError(
-            f"{where} has the stamp '{text}', not whole nanoseconds; spreadsheets round stamps, so get the file again"
+            f"{where} has the stamp '{text}', not whole nanoseconds; spreadsheets round stamps, so download it again"
         )
     return _checked(int(text), text, where)
 
@@ -81,7 +81,7 @@ def from_seconds(text: str, where: str, start: int = 0) -> int:
     try:
         stamp = start + int((Decimal(text) * 1_000_000_000).to_integral_value())
     except (InvalidOperation, ValueError, OverflowError) as error:
-        raise LogError(f"{where} has the time '{text}', not seconds; get the file again") from error
+        raise LogError(f"{where} has the time '{text}', not seconds; correct it or get it again") from error
     return _checked(stamp, text, where)
 
 
@@ -99,7 +99,7 @@ def from_date(text: str, where: str) -> int:
         offset = datetime.strptime(zone or "Z", "%z").tzinfo
         moment = datetime(*map(int, parts), tzinfo=offset)  # type: ignore[arg-type, misc]
     except ValueError as error:
-        raise LogError(f"{where} has the time '{text}', which is no date with time; get the file again") from error
+        raise LogError(f"{where} has the time '{text}', not a date and time; correct it or get it again") from error
     return _checked(int(moment.timestamp()) * 1_000_000_000 + int((fraction or "0").ljust(9, "0")), text, where)
 
 

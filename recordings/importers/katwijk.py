@@ -137,7 +137,7 @@ def _places(path: Path, notes: list[str]) -> list[Logged]:
         return []
     table = list(_table(path, 3))
     if any(not (abs(values[0]) <= 90 and abs(values[1]) <= 180) for _, values in table):
-        notes.append(f"{path.name} does not contain degrees; its places are left out")
+        notes.append(f"{path.name} does not contain degrees; its positions are left out")
         return []
     return [fix(stamp, GPS, *values[:3].tolist()) for stamp, values in table]
 
@@ -148,8 +148,8 @@ def _table(path: Path, columns: int) -> Iterator[tuple[int, Array]]:
     found = []
     for where, row in rows:
         if len(row) < columns + 1:
-            raise LogError(f"{where} has {len(row)} columns, but at least {columns + 1} are needed; get the file again")
+            raise LogError(f"{where} has {len(row)} columns, but at least {columns + 1} are needed; download it again")
         found.append((_time(row[0], where), numbers_of(row[1 : columns + 1], where)))
     if not found:
-        raise LogError(f"{path} contains no line that begins with a time; get the file again")
+        raise LogError(f"{path} contains no line that begins with a time; download it again")
     yield from sorted(found, key=lambda item: item[0])

@@ -71,7 +71,7 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     base = rig.mount
     if base is None:
         base = Transform(BASE, IMU, np.eye(3), np.array([0.0, 0.0, IMU_HEIGHT])).after(to_imu.inverse())
-        notes.append(f"base_link is {IMU_HEIGHT} m below the Imu, as on KITTI's car; the rig file can place it")
+        notes.append(f"base_link is {IMU_HEIGHT} m below the Imu, as on KITTI's car; the rig file can change this")
     stamps, table = _readings(source / "oxts")
     track = _track(stamps, table, source / "oxts")
     mounts, sensors = [base, right_in_left, to_imu], [_tilts(track), _fixes(stamps, table)]
@@ -92,7 +92,7 @@ def _calibration(path: Path) -> dict[str, Array]:
 
 def _entry(values: dict[str, Array], name: str, *shape: int) -> Array:
     if name not in values or values[name].size != int(np.prod(shape)):
-        raise LogError(f"KITTI's calibration lacks '{name}' with {int(np.prod(shape))} numbers; get the files again")
+        raise LogError(f"KITTI's calibration lacks '{name}' with {int(np.prod(shape))} numbers; download them again")
     return values[name].reshape(shape)
 
 
@@ -131,9 +131,9 @@ def _readings(oxts: Path) -> tuple[list[int], Array]:
             stamps.append(from_date(line, where))
             rows.append(next((numbers_of(text.split()[:6], place) for place, text in read_lines(path)), np.zeros(0)))
             if rows[-1].size < 6:
-                raise LogError(f"{path} has fewer than 6 numbers; get it again")
+                raise LogError(f"{path} has fewer than 6 numbers; download it again")
     if not rows:
-        raise LogError(f"{oxts} contains no readings of the Imu; get the drive's oxts folder")
+        raise LogError(f"{oxts} contains no readings of the Imu; download the oxts folder of the drive")
     return stamps, np.array(rows)
 
 

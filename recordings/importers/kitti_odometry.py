@@ -57,11 +57,11 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
          if path.exists()), None,
     )  # fmt: skip
     if poses is None:
-        notes.append("there are no poses, and no tilt in the files: the car is taken as level in every frame")
+        notes.append("the files contain neither poses nor tilt: the car is assumed level in every frame")
         level = np.array([0.0, 0.0, 0.0, 1.0])
         track, tilts = None, ((stamp, "/inclinometer", imu(stamp, BASE, level)) for stamp in stamps)
     else:
-        notes.append(f"the tilt is that of the first frame by the rig file, turned by the true poses in {poses.name}")
+        notes.append(f"the tilt is that of the rig file, rotated by the true poses in {poses.name}")
         track = _track(poses, stamps, mount, shift)
         tilts = tilts_of(track, [pair.stamp for pair in pairs])
     return ImportedRecording(
@@ -81,11 +81,11 @@ def stereo_camera(projections: list[Array], size: tuple[int, int]) -> tuple[Ster
     """The rectified camera of two projections (3, 4), and (3,) m from the first camera's place to the left one's."""
     left, right = projections
     if not all(projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0 for projection in projections):
-        raise LogError("KITTI's calibration has a projection without a focal length; get the files again")
+        raise LogError("KITTI's calibration has a projection without a focal length; download them again")
     shifts = [np.linalg.solve(projection[:, :3], projection[:, 3]) for projection in projections]
     baseline = float(shifts[0][0] - shifts[1][0])
     if not baseline > 0:
-        raise LogError(f"KITTI's calibration has a baseline of {baseline:g} m; get the files again")
+        raise LogError(f"KITTI's calibration has a baseline of {baseline:g} m; download them again")
     camera = StereoCamera(
         fx=float(left[0, 0]), fy=float(left[1, 1]), cx=float(left[0, 2]), cy=float(left[1, 2]), baseline=baseline,
         width=size[0], height=size[1], cx_right=float(right[0, 2]), frame_id=LEFT,
@@ -102,7 +102,7 @@ def _projections(path: Path) -> list[Array]:
         if (not colon or key.startswith("P")) and numbers.size == 12:
             found.append(numbers.reshape(3, 4))
     if len(found) < 4:
-        raise LogError(f"{path} has {len(found)} projections of 12 numbers, not P0 to P3; get it again")
+        raise LogError(f"{path} has {len(found)} projections of 12 numbers, not P0 to P3; download it again")
     return found
 
 
@@ -112,7 +112,7 @@ def _track(path: Path, stamps: list[int], mount: Transform, shift: Array) -> Tra
     for (where, line), stamp in zip(read_lines(path), stamps, strict=False):
         row = numbers_of(line.split(), where)
         if row.size != 12:
-            raise LogError(f"{where} has {row.size} numbers, not 12; get the file again")
+            raise LogError(f"{where} has {row.size} numbers, not 12; download it again")
         pose = row.reshape(3, 4)
         place = mount.rotation @ (pose[:, 3] - pose[:, :3] @ shift)
         turn = Rotation.from_matrix(mount.rotation @ orthonormal(pose[:, :3], where))

@@ -37,7 +37,7 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
         raise LogError(f"{source} has no folder image1/RGB; give the folder of one scene")
     rig.need("LuSNAR", "height", "pitch_down", *AXES)
     files = [{file.name: file for file in folder.glob("*.png")} for folder in folders]
-    notes = ["the tilt is that of the poses, as no sensor of the data set measures it"]
+    notes = ["the tilt is derived from the poses, as the data set has no tilt sensor"]
     if alone := len(files[0].keys() ^ files[1].keys()):
         notes.append(f"{counted(alone, 'image')} without a partner of the same stamp")
     pairs = [
@@ -62,7 +62,7 @@ def _track(path: Path, rig: Rig) -> Track:
     for where, line in read_lines(path):
         row = line.replace(",", " ").split()
         if len(row) < 8:
-            raise LogError(f"{where} has {len(row)} columns, but at least 8 are needed; get the file again")
+            raise LogError(f"{where} has {len(row)} columns, but at least 8 are needed; download it again")
         values = numbers_of(row[1:8], where)
         turn = upright @ rotation_of(np.roll(values[3:], -1), where).as_matrix() @ axes
         poses.append((nanoseconds(row[0], where), upright @ values[:3], Rotation.from_matrix(turn)))

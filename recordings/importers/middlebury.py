@@ -109,17 +109,17 @@ def read_pfm(path: Path) -> Array:
     data = read_bytes(path)
     header = _PFM.match(data)
     if header is None:
-        raise LogError(f"{path} is not a PFM file of one channel ('Pf', width, height, scale); get it again")
+        raise LogError(f"{path} is not a PFM file of one channel ('Pf', width, height, scale); download it again")
     try:
         width, height, scale = int(header[1]), int(header[2]), float(header[3])
     except ValueError as error:
-        raise LogError(f"{path}: its scale {header[3].decode()} is not a number; get it again") from error
+        raise LogError(f"{path}: its scale {header[3].decode()} is not a number; download it again") from error
     size, expected = len(data) - header.end(), 4 * width * height
     if size != expected or not expected:
-        raise LogError(f"{path} has {size} bytes of pixels, but {width}x{height} pixels need {expected}; get it again")
+        raise LogError(f"{path} has {size} bytes of pixels, not {expected} for {width}x{height}; download it again")
     rows = np.frombuffer(data, "<f4" if scale < 0 else ">f4", offset=header.end()).reshape(height, width)
     if not np.isfinite(rows).any():
-        raise LogError(f"{path} has no known pixel; get it again")
+        raise LogError(f"{path} has no known pixel; download it again")
     return np.where(np.isfinite(rows), rows, np.nan).astype(np.float32)[::-1].copy()
 
 
@@ -136,14 +136,14 @@ def _calibration(path: Path) -> tuple[dict[str, str], dict[str, float]]:
         (fx, _, cx), (_, fy, cy) = (float(value) for value in cam0[0]), (float(value) for value in cam0[1])
         doffs_of_cams = float(_matrix(text["cam1"])[0, 2]) - cx if "cam1" in text else values["doffs"]
     except (ValueError, IndexError) as error:
-        raise LogError(f"{path} has an entry that is not a number or matrix ({error}); get it again") from error
+        raise LogError(f"{path} has an entry that is not a number or matrix ({error}); download it again") from error
     doffs, baseline = values.pop("doffs"), values["baseline"] / 1000  # from mm
     values |= {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "cx_right": cx + doffs, "baseline": baseline}
     for name, value in values.items():
         if not np.isfinite(value) or (name in _POSITIVE and value <= 0):
-            raise LogError(f"{path}: {name} is {value:g}, which is impossible for a camera; get it again")
+            raise LogError(f"{path}: {name} is {value:g}, which is impossible for a camera; download it again")
     if abs(doffs_of_cams - doffs) > MAX_DOFFS_ERROR_PX:
-        raise LogError(f"{path}: doffs is {doffs:g}, but {doffs_of_cams:g} by cam0 and cam1; get it again")
+        raise LogError(f"{path}: doffs is {doffs:g}, but {doffs_of_cams:g} by cam0 and cam1; download it again")
     return text, values
 
 
@@ -156,7 +156,7 @@ def _codes(path: Path) -> Array:
     data = np.frombuffer(read_bytes(path), np.uint8)
     mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if mask is None:
-        raise LogError(f"{path} is not a readable image; get it again")
+        raise LogError(f"{path} is not a readable image; download it again")
     if invalid := np.setdiff1d(mask, (SEEN_BY_BOTH, SEEN_BY_ONE, SEEN_BY_NONE)).tolist():
         raise LogError(f"{path} has a pixel of {invalid[0]}; an occlusion mask has only 255, 128 and 0")
     return np.asarray(mask)

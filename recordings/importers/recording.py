@@ -1,4 +1,4 @@
-"""Writes a recording from other people's files as a log: calibration, mounts, images, sensors and truth.
+"""Writes a recording of a data set as a log: calibration, mounts, images, sensors and truth.
 
 Images of PNG and JPEG files are logged with their bytes unchanged. Messages keep the stamps of the files, and are in
 their order. The log gets its name when it is complete. An import that was interrupted is continued by the next one of
@@ -171,13 +171,13 @@ def _images(
 
 
 def image_message(stamp: int, frame: str, path: Path, model: CameraModel) -> Any:
-    """The message of an image file. Raises LogError if it is cut or does not fit the calibration."""
+    """The message of an image file. Raises LogError if it is truncated or does not fit the calibration."""
     if (size := image_size(path)) != (model.width, model.height):
         raise LogError(f"{path} is {size[0]}x{size[1]}, but the calibration is for {model.width}x{model.height}")
     content = read_bytes(path)
     if encoding := encoding_of(content):
         if is_cut(content):
-            raise LogError(f"{path} is cut after {len(content)} bytes")
+            raise LogError(f"{path} is truncated after {len(content)} bytes")
         return ros2.compressed_image(stamp, frame, np.frombuffer(content, np.uint8), encoding)
     return ros2.image(stamp, frame, read_pixels(path))
 

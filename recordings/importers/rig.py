@@ -60,7 +60,7 @@ class Rig(Checked):
     where: str = field(default="", init=False)
 
     def need(self, kind: str, *names: str) -> None:
-        """Raise LogError if one of the entries is missing that the data set does not say."""
+        """Raise LogError if an entry is missing that the data set does not contain either."""
         for known in fields(self):
             if known.name in names and getattr(self, known.name) is None:
                 unit = {"rad": ", in deg", "m": ", in m"}.get(known.metadata.get("unit", ""), "")
@@ -81,7 +81,7 @@ class Rig(Checked):
     @property
     def poses(self) -> tuple[Array, Array]:
         """The rotations (3, 3) from the data set's world to one with z up, and from x forward, y left, z up to the axes
-        of its body. Raises LogError if the axes are none."""
+        of its body. Raises LogError if the axes are invalid."""
         axes = [_AXES.get(letter) for letter in self.body_axes or ""]
         turn = np.array([axis for axis in axes if axis is not None], np.float64)
         if len(axes) != 3 or turn.shape != (3, 3) or not np.isclose(np.linalg.det(turn), 1):
@@ -114,7 +114,7 @@ _UPRIGHT = {
 def read_rig(path: Path | None, entries: Collection[str]) -> Rig:
     """The rig of a file with some of these entries; an empty one without a file.
 
-    Raises LogError for another entry or a value that is none.
+    Raises LogError for an unknown entry or an invalid value.
     """
     if path is None:
         return Rig()

@@ -48,7 +48,7 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
     if named is None:
         raise LogError(f"{source} has no folder image_{CAMERAS[0][0]}; give the folder of one trajectory, such as P000")
     left, right = named
-    notes = ["the tilt is that of the poses, as no sensor of the data set measures it"]
+    notes = ["the tilt is derived from the poses, as the data set has no tilt sensor"]
     found: dict[int, ImagePair] = {}
     alone = 0
     for file in sorted((source / f"image_{left}").glob(f"*_{left}.png")):
@@ -101,4 +101,4 @@ def _depth(path: Path) -> Array:
         content = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
         return np.ascontiguousarray(content).view("<f4")[:, :, 0]
     except (ValueError, IndexError, TypeError, EOFError, OSError, SyntaxError, TokenError, cv2.error) as error:
-        raise LogError(f"{path} is not a depth image of four bytes a pixel; get it again") from error
+        raise LogError(f"{path} is not a depth image of four bytes a pixel; download it again") from error

@@ -30,9 +30,9 @@ class Track:
 
     @staticmethod
     def of(body: str, poses: Sequence[tuple[int, Array, Rotation]], where: object) -> Track:
-        """The track of (stamp, position, rotation) in any order. Raises LogError for a position that is none."""
+        """The track of (stamp, position, rotation) in any order. Raises LogError for an invalid position."""
         if not poses:
-            raise LogError(f"{where} contains no pose; get the file again")
+            raise LogError(f"{where} contains no pose; download it again")
         ordered = sorted({stamp: (place, turn) for stamp, place, turn in poses}.items())
         places = np.array([place for _, (place, _) in ordered])
         if (wrong := np.flatnonzero(~np.isfinite(places).all(axis=1))).size:

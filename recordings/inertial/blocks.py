@@ -1,6 +1,6 @@
 """Blocks of inertial samples, integrated by the gyroscope.
 
-The gyroscope turns every acceleration into one frame, which does not turn with the sensor. There gravity stands still,
+The gyroscope rotates every acceleration into one frame, which does not turn with the sensor. In it gravity is constant
 but for the gyroscope's errors, so accelerations can be averaged over a block.
 """
 

@@ -47,7 +47,7 @@ def imu_content(messages: DecodedTopics, topic: str) -> ImuContent:
     if np.any(forces) and not gravity:
         return ImuContent("" if seen else f"{why}; its accelerations contain no gravity", gravity, rates)
     if gravity and len(seen) > 1 and set(seen) == {_IDENTITY}:
-        return ImuContent("it is 1 in every message, as of a driver that has none", gravity, rates)
+        return ImuContent("it is 1 in every message, as from a driver without an orientation", gravity, rates)
     return ImuContent("" if seen else why, gravity, rates)
 
 

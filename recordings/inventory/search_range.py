@@ -45,7 +45,7 @@ def search_range(camera: StereoCamera, up: Array, height: float) -> dict[str, An
     doubt, most = "", min(camera.width, MAX_DISPARITIES)
     if ground >= most:
         doubt = (
-            f"level ground would have up to {ground:.0f} px, and no search in these images reaches beyond {most} px: "
+            f"level ground would have up to {ground:.0f} px, but a search in these images ends at {most} px: "
             f"the baseline of {camera.baseline:g} m, or the height of {height:.2f} m, looks wrong"
         )
     return {

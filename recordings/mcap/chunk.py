@@ -47,7 +47,7 @@ class Unpacking:
     def of(self, packed: Buffer, unpack: Callable[[Buffer, int], Buffer], size: int) -> Buffer:
         """The first `size` bytes by `unpack`. Raises LogError where there are too many already."""
         if self._left < 0:
-            raise LogError(f"the log's parts unpack to over {_MAX_PARTS_RATIO} times their size: no recording does")
+            raise LogError(f"the log's parts unpack to over {_MAX_PARTS_RATIO} times their size, unlike any recording")
         found = unpack(packed, size)
         self._left += _MAX_PARTS_RATIO * len(packed) - len(found)
         return found
@@ -62,7 +62,7 @@ def check_size(index: Index, path: Path, size: int) -> None:
     """Raise LogError for a file whose chunks unpack to more than those of a recording could. size: of the file."""
     total = sum(chunk.uncompressed_size for chunk in index.chunks)
     if total > max(_FREE_FILE_BYTES, MAX_RATIO * size):
-        raise LogError(f"{path} unpacks to {total} bytes, {total // size} times its size: no recording does")
+        raise LogError(f"{path} unpacks to {total} bytes, {total // size} times its size, unlike any recording")
 
 
 def is_chunk(head: bytes) -> bool:

@@ -190,6 +190,6 @@ def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None,
                     index.define(opcode, content)
     if found is None:
         held = counted(len(index.counted_times), "message")
-        index.note_damage(f"the log is cut or damaged at byte {position} of {size}; before that it contains {held}")
+        index.note_damage(f"the log is truncated or damaged at byte {position} of {size}; intact before it: {held}")
     else:
         index.note_damage(f"the log is damaged from byte {position} to byte {found}; messages there may be lost")

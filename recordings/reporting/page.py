@@ -32,7 +32,7 @@ STYLE = Path(__file__).with_name("style.css")
 def write_report(path: Path, results: Sequence[Path]) -> None:
     """Write the page of one result log, or of two beside each other.
 
-    Raises LogError if a file is no result log or cannot be read, and UnwritableError if the page cannot be written.
+    Raises LogError if a file is not a result log or cannot be read, and UnwritableError if the page cannot be written.
     """
     facts = [read_facts(results[0])]
     facts += [read_facts(result, facts[0].drawn) for result in results[1:]]
@@ -87,7 +87,7 @@ def html_table(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> str:
 
 def _verdict(facts: RunFacts) -> str:
     """Verdict, counts and findings."""
-    verdict = facts.counts.get("verdict", "the log was cut before its verdict")
+    verdict = facts.counts.get("verdict", "the log is truncated before its verdict")
     drops = {name.removeprefix("drops."): value for name, value in facts.counts.items() if name.startswith("drops.")}
     findings = [(name.removeprefix("findings."), value) for name, value in facts.counts.items() if "findings." in name]
     rows = [
@@ -145,7 +145,7 @@ def _plots(facts: Sequence[RunFacts], names: Sequence[str]) -> str:
         plots.append(line_plot(name, curves))
     for frame_id in dict.fromkeys(frame_id for found in facts for frame_id in found.tracks):
         tracks = {name: found.tracks.get(frame_id, []) for name, found in zip(names, facts, strict=True)}
-        plots.append(track_plot(f"way in {frame_id}, x right, y up, m", tracks))
+        plots.append(track_plot(f"trajectory in {frame_id}, x right, y up, m", tracks))
     return f"<div class=pictures>{''.join(plots)}</div>"
 
 
@@ -169,7 +169,7 @@ def _losses(facts: RunFacts) -> str:
 
 def _parameters(facts: RunFacts) -> str:
     changes = facts.about.get("overrides", "")
-    shown = f"<p>Changes:</p><pre>{escape(changes)}</pre>" if changes else "<p>The pipeline as it is.</p>"
+    shown = f"<p>Changes:</p><pre>{escape(changes)}</pre>" if changes else "<p>No changes to the pipeline.</p>"
     files = _files(facts.about.get("pipeline", ""))
     return shown + "".join(
         f"<details><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>" for name, text in files.items()

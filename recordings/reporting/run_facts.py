@@ -46,7 +46,7 @@ def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) 
     """Read a result log twice: once for its figures, and once for the frames that are drawn.
 
     beside: what is drawn of a result that stands beside it; the frames of the same stamps are drawn, if it has them.
-    Raises LogError if the file is no result log, or cannot be read.
+    Raises LogError if the file is not a result log, or cannot be read.
     """
     about = facts_of(path, "a log that roverflow run wrote")
     check_profile(path, about)

@@ -77,7 +77,7 @@ def _finite(vector: Any, what: str) -> Array:
     """A geometry_msgs/Vector3 or Point (3,), m, below `MAX_DISTANCE_M`."""
     values = np.array([vector.x, vector.y, vector.z])
     if not (np.abs(values) < MAX_DISTANCE_M).all():  # or NaN
-        raise LogError(f"{what} is {values.tolist()}, which is no place")
+        raise LogError(f"{what} is {values.tolist()}, which is not a position")
     return values
 
 

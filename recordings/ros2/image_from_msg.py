@@ -80,7 +80,7 @@ def _raw_pixels(message: Any, size: tuple[int, int] | None, max_pixels: int) -> 
         raise LogError(f"the image's step of {step} bytes is shorter than a row of {width} {message.encoding} pixels")
     needed = (height - 1) * step + row  # the last row may lack its padding
     if data.size < needed:
-        raise LogError(f"the image is cut: it has {data.size} of {needed} bytes")
+        raise LogError(f"the image is truncated: it has {data.size} of {needed} bytes")
     rows = np.lib.stride_tricks.as_strided(data, (height, row), (step, 1), writeable=False)
     if luma is not None:
         return np.ascontiguousarray(rows[:, luma[1] :: luma[0]])
@@ -94,7 +94,7 @@ def _compressed_pixels(message: Any, size: tuple[int, int] | None, max_pixels: i
     data = np.ascontiguousarray(message.data, np.uint8)
     content = data.tobytes()
     if is_cut(content):
-        raise LogError(f"the compressed image is cut after {data.size} bytes")
+        raise LogError(f"the compressed image is truncated after {data.size} bytes")
     if content.startswith(b"\xff\xd8") and (scans := content.count(b"\xff\xda")) > _MAX_SCANS:
         raise LogError(f"the compressed image has {scans} scans; the limit is {_MAX_SCANS}")
     stated = stated_size(content)

@@ -137,7 +137,7 @@ class AccelerationField:
     """Three accelerations in a message."""
 
     field: str = parameter(MISSING, "path of the field with x, y and z, such as vector, or the paths of three numbers")
-    sign: int = parameter(1, "1: at rest the acceleration points up, as that of an Imu does; -1: down", choices=(1, -1))
+    sign: int = parameter(1, "1: at rest the acceleration points up, as from an Imu; -1: down", choices=(1, -1))
 
     def __post_init__(self) -> None:
         check_parameters(self)

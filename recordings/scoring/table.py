@@ -18,7 +18,7 @@ ROWS = (
     "levelled height RMSE, cm: 0-4 m; 4-8 m",
     "visible cells with a value; of these within 5 cm (levelled), %",
     "hallucinated values (no camera could see their cells), % of values",
-    "values in cells that no pixel hits, %: all; not interpolated",
+    "values in cells without a pixel, %: all; not marked interpolated",
     "levelled errors within 1; 2 stated random sigmas (ideal 68; 95), %",
     "raw errors within 1; 2 stated total sigmas (ideal 68; 95), %",
     "detected rocks, at least half visible: 0.2 m; 0.3 m and higher",
@@ -58,8 +58,8 @@ def format_brief(found: Score) -> str:
         detected = [f"{rock['detected']:.0f} of {rock['visible']:.0f}" for rock in rocks.values()]
         lines += [
             f"elevation    {known} of visible cells known; RMS error {near} cm up to 4 m away, {far} cm up to 8 m",
-            f"hazards      {recall} of them detected, {missed} called free; {alarms} of safe cells called hazards",
-            f"rocks        {detected[0]} of 0.2 m and higher detected, {detected[1]} of 0.3 m and higher",
+            f"hazards      {recall} detected, {missed} called free; {alarms} of safe cells called hazards",
+            f"rocks        {detected[0]} detected from a height of 0.2 m, {detected[1]} from 0.3 m",
         ]
     return "\n".join([*lines, *_motion_lines(found)])
 
@@ -120,14 +120,14 @@ def _disparity_lines(d: dict[str, Any]) -> list[str]:
     share_hidden, bad = _percent(hidden["share"]), _percent(hidden["bad_2"])
     limits = "".join(f"{f'bad-{limit:g}':>8}" for limit in THRESHOLDS)
     return [
-        "disparity    bad-T: share wrong by over T px, or unknown; MAE and RMS error of the known, px",
+        "disparity    bad-T: share wrong by over T px or unknown; MAE and RMS error of known pixels, px",
         f"               whole image       pixels    known |{limits} |     MAE     RMS",
         *(_region_line(name, d["whole_image"][name]) for name in REGIONS),
         *(_region_line(name, m) for name, m in d.get("by_surface", {}).items() if m["pixels"]),
         *(_known_line(name, d["whole_image"][name]) for name in ("nonocc", "all")),
         *_cropped_lines(d["cropped_image"]),
         "             estimates where stereo cannot measure",
-        f"               only one camera sees  {share_hidden:>7} of all estimates, {bad} of these wrong by over 2 px",
+        f"               seen by one camera    {share_hidden:>7} of all estimates, {bad} of these wrong by over 2 px",
         f"               no true value         {_percent(beyond['share']):>7} of all estimates (sky, or no truth)",
     ]
 
@@ -151,7 +151,7 @@ def _region_line(name: str, m: dict[str, float]) -> str:
 
 def _known_line(name: str, m: dict[str, float]) -> str:
     bad = "".join(f"{_percent(m[f'bad_{limit:g}_known']):>8}" for limit in THRESHOLDS)
-    return f"               {f'{REGION_NAMES[name]}, of the known ones':<33} |{bad} |"
+    return f"               {f'{REGION_NAMES[name]}, known pixels only':<33} |{bad} |"
 
 
 def terrain_figures(found: dict[str, Any]) -> list[str]:
@@ -182,7 +182,7 @@ def terrain_lines(found: dict[str, Any]) -> list[str]:
         "terrain      heights of cells that both cameras see, by distance from base_link; errors in cm",
         "               distance      cells    known |   RMSE    MAE   bias   NMAD  within 5 cm",
     ]
-    levelled = ["               levelled: minus the best-fit plane of each frame's errors (tilt and offset)"]
+    levelled = ["               levelled: without the best-fit plane of each frame's errors (tilt and offset)"]
     for kind, title in (("raw", []), ("levelled", levelled)):
         lines += title
         for name, ring in found["heights"].items():

@@ -72,33 +72,33 @@ class McapSink:
 
     results: tuple[str, ...] = parameter(
         ("disparity", "points", "elevation_map", "navigation_map", "pose", "regional_map", "regional_navigation_map"),
-        "streams to write; the run leaves no log if it makes none of them",
+        "streams to write; without any of them the run writes no log",
     )
     also: tuple[str, ...] = parameter((), "further streams to write")
     disparity_step: float = parameter(
-        1 / 32, "what disparities are rounded to, which takes a third of the room; 0: exact", unit="px", low=0, high=1
+        1 / 32, "rounding step of disparities, which saves two thirds of the space; 0: exact", unit="px", low=0, high=1
     )
     point_spacing: float = parameter(
-        0.02, "side of the cubes of which each keeps one point, the first in the cloud; 0: all points", unit="m",
+        0.02, "side of cubes that keep only their first point; 0: all points", unit="m",
         low=0, high=10,
     )  # fmt: skip
     length_step: float = parameter(
-        1 / 1024, "what heights of maps and coordinates of points are rounded to; 0: exact", unit="m", low=0, high=1
+        1 / 1024, "rounding step of map heights and point coordinates; 0: exact", unit="m", low=0, high=1
     )
     precision: float = parameter(
-        0.01, "largest relative error by which variances, slopes, roughness and sigmas are rounded; 0: exact", low=0,
+        0.01, "largest relative rounding error of variances, slopes, roughness and sigmas; 0: exact", low=0,
         high=0.1,
     )  # fmt: skip
     viewers: bool = parameter(
-        False, "also write depth, left image, coloured terrain and codes as colours, which viewers draw without plugins"
+        False, "also write depth, left image, coloured terrain and coloured codes, which viewers draw without plugins"
     )
     compression: str = parameter(
-        "lz4", "of the log; zstd takes a third less room than lz4 and twice the time", choices=tuple(COMPRESSIONS)
+        "lz4", "compression; zstd takes a third less space than lz4 and twice the time", choices=tuple(COMPRESSIONS)
     )
 
     profile: str = parameter(
         "ros2",
-        "messages of the log; Foxglove draws its own without extensions; score, export, diff and report read only ros2",
+        "message types; Foxglove draws its own without extensions; score, export, diff and report read only ros2",
         choices=("ros2", "foxglove"),
     )  # fmt: skip
 

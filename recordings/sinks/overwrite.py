@@ -63,7 +63,7 @@ def is_ours(path: Path, kind: str) -> bool:
 def refuse_foreign(path: Path, kind: str) -> None:
     """Raise UnwritableError for a file that no earlier run wrote, such as the log that is read."""
     if Path(path).is_file() and not is_ours(Path(path), kind):
-        raise UnwritableError(f"cannot write {path}: it exists and is no {kind} of roverflow; choose another name")
+        raise UnwritableError(f"cannot write {path}: it exists and is not a roverflow {kind}; choose another name")
 
 
 def _has_keys(path: Path, keys: set[str]) -> bool:

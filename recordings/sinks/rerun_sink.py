@@ -40,18 +40,18 @@ class RerunSink(Checked):
     """
 
     max_width: int = parameter(
-        0, "widest picture; an intermediate has three eighths of it. 0: half as wide as the camera's images, but 320 "
-        "to 640 px, and intermediates 120 to 240 px",
+        0, "largest width of pictures; intermediates have three eighths of it. 0: half the width of the images, but "
+        "320 to 640 px, and for intermediates 120 to 240 px",
         low=0, unit="px",
     )  # fmt: skip
-    jpeg_quality: int = parameter(75, "of the camera images", low=1, high=100)
-    every: int = parameter(1, "images, clouds and surfaces of each n-th frame are drawn", low=1)
+    jpeg_quality: int = parameter(75, "JPEG quality of the camera images", low=1, high=100)
+    every: int = parameter(1, "draw images, clouds and surfaces of every n-th frame", low=1)
     max_megabytes: int = parameter(
-        0, "room of the recording before its compression; 0: no limit. Images, clouds and surfaces are drawn half as "
-        "often each time that half of the remaining room is used",
+        0, "size limit of the recording before compression; 0: no limit. Images, clouds and surfaces are drawn half as "
+        "often each time that half of the remaining space is used",
         low=0, unit="MB",
     )  # fmt: skip
-    without: tuple[str, ...] = parameter((), "streams that are not drawn, as names or patterns such as disparity/*")
+    without: tuple[str, ...] = parameter((), "streams not to draw: names, or patterns such as disparity/*")
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     live_pipe: int = set_by_run(0)  # file descriptor to a viewer, which gets the recording as it is written; 0: none

@@ -50,7 +50,7 @@ class CalibrationHistory:
         place = bisect_right(self.stamps, stamp) - 1
         if place >= 0 and not self.same[place]:
             raise LogError(
-                "the calibration differs from the log's first one, so the image cannot be used; cut the log in two "
+                "the calibration differs from the log's first one, so the image cannot be used; split the log "
                 f"where it changes ({self._since(place)})"
             )
 

@@ -56,7 +56,7 @@ def _joint(where: str, entry: Any) -> Joint:
     from scipy.spatial.transform import Rotation  # takes long to import
 
     if not isinstance(entry, dict):
-        raise LogError(f"{where} is no mapping of parent, child, xyz, rpy and axis")
+        raise LogError(f"{where} is not a mapping of parent, child, xyz, rpy and axis")
     if unknown := sorted(map(str, entry.keys() - _VECTORS.keys() - {"parent", "child"})):
         raise LogError(f"{where} has the unknown key '{unknown[0]}'; it may have parent, child, xyz, rpy and axis")
     for name in ("parent", "child"):

@@ -215,7 +215,7 @@ class SourceResolution:
             self.mount, self.moving = mount, moving
             return
         if joints and (others := other_joints(self.messages, joints)):
-            self.refused["joints"] = f"{self.source.joints} has only joints that the log has no angles of; {others}"
+            self.refused["joints"] = f"the log has no angles of any joint in {self.source.joints}; {others}"
         quaternion = "with the rotation from inclinometer to left camera, x, y, z, w"
         self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0, 0, 0, 1]}, quaternion)]
         self.unavailable["mount"] = str(mount)
@@ -228,7 +228,7 @@ class SourceResolution:
         if others := self._frames_of_camera():
             self.refused["base_frame"] = (
                 f"the source's 'base_frame' is set to '{base}', but /tf_static joins the camera to {others} only; set "
-                "it to one of these, or record how the camera sits on it"
+                "it to one of these, or record its transform to the camera"
             )
 
     def _frames_of_camera(self) -> str:

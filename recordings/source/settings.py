@@ -29,40 +29,40 @@ class LogSettings:
     left_info: str | None = parameter(None, "topic of the left camera's CameraInfo")
     right_info: str | None = parameter(None, "topic of the right camera's CameraInfo")
     calibration: str | tuple[str, ...] | None = parameter(
-        None, "calibration files instead of CameraInfo, by the working directory: of ROS, Kalibr, EuRoC or OpenCV"
+        None, "calibration files instead of CameraInfo, of ROS, Kalibr, EuRoC or OpenCV; relative to the working folder"
     )
     inclinometer: str | None = parameter(
         None,
-        "topic of an Imu or QuaternionStamped; with pitch, roll and tilt_model, or with accelerations, of any message; "
-        "with upright_frame, of poses",
+        "topic of the tilt: an Imu or QuaternionStamped; any message if pitch, roll and tilt_model, or accelerations, "
+        "are set; poses if upright_frame is set",
     )
     gyroscope: str | None = parameter(
-        None, "topic of the Imu with the rates; up is then estimated, even if there is an orientation"
+        None, "topic of an Imu with angular rates; the tilt is then estimated, even if there is an orientation"
     )
     accelerations: AccelerationField | None = parameter(
-        None, "field of the accelerations, for an inclinometer that is no Imu"
+        None, "field of the accelerations, for an inclinometer that is not an Imu"
     )
     gravity: float | None = parameter(
-        None, "magnitude of gravity, for an estimate of up (Mars: 3.71, Moon: 1.62); none: measured",
+        None, "magnitude of gravity, for an estimated tilt (Mars: 3.71, Moon: 1.62); none: measured",
         unit="m/s^2", low=0.1, high=30.0,
     )  # fmt: skip
     accelerometer_bias: float = parameter(
-        0.05, "error of the accelerometer at rest, one sigma of each axis; 0.05 m/s^2 are 0.3 degrees of tilt on Earth",
+        0.05, "bias of the accelerometer, one sigma of each axis; 0.05 m/s^2 are 0.3 degrees of tilt on Earth",
         unit="m/s^2", low=1e-4, high=5.0,
     )  # fmt: skip
     upright_frame: str | None = parameter(
-        None, "frame whose z axis points up, if the tilt is that of poses in it (Odometry, PoseStamped, TFMessage)"
+        None, "frame of poses, with z up, if the tilt is taken from them (Odometry, PoseStamped, TFMessage)"
     )
     odometry: str | None = parameter(
         None,
-        "topic of an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage that places base_frame; none: "
-        "no pose of the log",
+        "topic of the pose: an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage with base_frame; "
+        "none: no pose of the log",
     )
-    pitch: AngleField | None = parameter(None, "field of the pitch, for an inclinometer with plain angles")
-    roll: AngleField | None = parameter(None, "field of the roll, for an inclinometer with plain angles")
+    pitch: AngleField | None = parameter(None, "field of the pitch, for an inclinometer with bare angles")
+    roll: AngleField | None = parameter(None, "field of the roll, for an inclinometer with bare angles")
     tilt_model: str | None = parameter(
         None,
-        "axis: plain angles are those of the sensor's axes to the horizon; euler: Euler angles",
+        "meaning of bare angles; axis: angles of the sensor's axes to the horizon; euler: Euler angles",
         choices=("axis", "euler"),
     )
     camera_from_inclinometer: tuple[float, ...] | None = parameter(
@@ -71,11 +71,11 @@ class LogSettings:
         "for a log without static transforms",
     )
     joints: str | None = parameter(
-        None, "YAML file of the axes that move the camera on the rover, whose angles are in a JointState"
+        None, "YAML file of the joints that move the camera on the rover; a JointState has their angles"
     )
-    max_pixels: int = parameter(MAX_PIXELS, "pixels of the largest image that is decoded", low=1)
+    max_pixels: int = parameter(MAX_PIXELS, "largest number of pixels of an image", low=1)
     max_rate: int = parameter(
-        MAX_RATE, "messages per second, over ten seconds of log time, of the fastest topic that is read",
+        MAX_RATE, "highest message rate of a topic, over ten seconds of log time",
         unit="Hz", low=1,
     )  # fmt: skip
     base_frame: str = parameter("base_link", "the rover's frame")
@@ -91,13 +91,13 @@ class LogSettings:
             raise ValueError(f"McapSource.camera_from_inclinometer must be a unit quaternion x, y, z, w, not {given!r}")
 
     def angles(self) -> PlainAngles | None:
-        """The meaning of plain angles; None if not set. Raises ValueError if only a part is set."""
+        """The meaning of bare angles; None if not set. Raises ValueError if only a part is set."""
         given = {"pitch": self.pitch, "roll": self.roll, "tilt_model": self.tilt_model}
         if not any(value is not None for value in given.values()):
             return None
         for name, value in given.items():
             if value is None:
-                raise ValueError(f"McapSource needs '{name}': plain angles need pitch, roll and tilt_model")
+                raise ValueError(f"McapSource needs '{name}': bare angles need pitch, roll and tilt_model")
         model: Any = self.tilt_model
         return PlainAngles(self.pitch, self.roll, model)  # type: ignore[arg-type]  # none of them is None
 

@@ -85,15 +85,15 @@ class TiltReading:
         """What a user should know; empty if the log contains the tilt. estimator: after a run."""
         because = f", because its orientation is not used: {self.why}" if self.why else ""
         if self.kind == TiltKind.POSE:
-            return f"the tilt is that of the poses on {self.topic}, in '{settings.upright_frame}' with z up"
+            return f"the tilt is that of the poses on {self.topic}, whose frame '{settings.upright_frame}' has z up"
         if self.kind == TiltKind.ACCELERATIONS:
-            return f"the tilt is the direction of each acceleration on {self.topic}, right only at rest{because}"
+            return f"the tilt is the direction of the acceleration on {self.topic}, right only at rest{because}"
         if self.kind != TiltKind.ESTIMATE:
             return ""
         parts = f"accelerations and rates on {self.topic}"
         if self.gyroscope != self.topic:
             parts = f"accelerations on {self.topic} and the rates on {self.gyroscope}"
-        said = f"up is estimated from the {parts}{because}"
+        said = f"the tilt is estimated from the {parts}{because}"
         if estimator is None or not estimator.seconds:
             return said
         return (
@@ -106,8 +106,8 @@ class TiltReading:
         if not estimator.contradicts:
             return None
         return Finding(
-            f"The rates on {self.gyroscope} contradict the accelerations on {self.topic}, so the estimate of up is "
-            "wrong. Check the axes, the signs and the unit (rad/s) of the gyroscope.",
+            f"The rates on {self.gyroscope} contradict the accelerations on {self.topic}, so the estimated tilt "
+            "is wrong. Check the axes, the signs and the unit (rad/s) of the gyroscope.",
             Severity.FAULT,
             about="tilt",
         )
@@ -120,7 +120,7 @@ def _gravity(measured: float, given: float | None) -> str:
         differs = abs(measured / given - 1) > GRAVITY_RTOL
         return f"{found}, but 'gravity' of the source is {given:g}; correct it" if differs else found
     near = [name for name, value in GRAVITIES.items() if abs(measured / value - 1) < GRAVITY_RTOL]
-    return f"{found}, as on {near[0]}" if near else f"{found}, as on none of {', '.join(GRAVITIES)}; check the unit"
+    return f"{found}, as on {near[0]}" if near else f"{found}, unlike on {', '.join(GRAVITIES)}; check the unit"
 
 
 def estimated_tilts(samples: Iterable[Sampled], estimator: UpEstimator) -> Iterator[tuple[int, Tilt | LogError]]:

@@ -22,9 +22,9 @@ TRANSFORM_ATOL = 1e-6  # m and matrix elements; two transforms that differ by mo
 
 
 def orthonormal(matrix: Array, where: str) -> Array:
-    """The rotation (3, 3) that a matrix of rounded numbers stands for. Raises LogError if it stands for none."""
+    """The rotation (3, 3) nearest to a matrix of rounded numbers. Raises LogError if its axes are not orthonormal."""
     if not np.abs(matrix @ matrix.T - np.eye(3)).max() <= MAX_ROUNDING or np.linalg.det(matrix) < 0:
-        raise LogError(f"{where} contains no rotation: its axes are not orthonormal; get the file again")
+        raise LogError(f"{where} contains no rotation: its axes are not orthonormal; correct it")
     return nearest_rotation(matrix)
 
 

@@ -31,7 +31,7 @@ class PointCloud:
     shape : (H, W), optional
         Size of that image.
     sensor : Transform, optional
-        The camera in `frame_id`; None while the cloud is in the camera's own frame.
+        Pose of the camera in `frame_id`; None while the cloud is in the camera's own frame.
     source : (N,) uint8, optional
         Codes of `PixelOrigin`; None if all points are measured.
     tilt_sigma : float

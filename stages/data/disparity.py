@@ -29,7 +29,7 @@ class Disparity:
     camera
         The rectified camera, if it is known.
     sigma
-        (H, W) float32, px, standard deviation of a known disparity that is no blunder (inf = no evidence, NaN = not
+        (H, W) float32, px, standard deviation of a known disparity that is not a mismatch (inf = no evidence, NaN = not
         known yet), or None.
     costs
         (2, H, W) uint8: the smallest sum of costs that the search found at a pixel, and the smallest of all disparities
@@ -69,14 +69,14 @@ class Disparity:
 
 @dataclass(frozen=True)
 class MatchHealth:
-    """The matched shares of a frame.
+    """The matched shares of a frame's pixels.
 
     Parameters
     ----------
     stamp : int
-        Of the frame.
+        That of the frame, ns.
     all, near : float
-        Of all pixels, and of the nearest ground in view.
+        Matched share of all pixels, and of those of the nearest ground in view.
     """
 
     stamp: int

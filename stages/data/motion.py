@@ -61,7 +61,7 @@ class Transform:
 
 @dataclass(frozen=True, eq=False)
 class Tilt:
-    """The direction of up, as the inclinometer measures it.
+    """The up direction, as the inclinometer measures it.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class Tilt:
     sigma : float, optional
         Standard deviation, rad, about each horizontal axis; None if unknown.
     filtered : bool
-        Whether a filter made it. Its error is then that of its neighbours, and no smoothing makes it smaller.
+        Whether a filter estimated it. Its neighbours then have the same error, and smoothing does not reduce it.
 
     Examples
     --------
@@ -234,7 +234,7 @@ class CameraMotion:
     segment : int
         Number of the track, from 1; 0 before the first usable frame. A new one begins where tracking is lost.
     camera : Transform or None
-        The camera in the first camera of its segment; None if this frame cannot be tracked.
+        Pose of the camera in the first camera of its segment; None if this frame cannot be tracked.
     covariance : (6, 6) float64
         Of `camera`: position (m) and rotation (rad) about the fixed axes. It grows along the segment.
     inliers : int

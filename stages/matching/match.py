@@ -77,7 +77,7 @@ class Match(Stage):
     paths: int = parameter(8, "directions of aggregation", choices=(4, 8))
     p1: int = parameter(
         16,
-        "penalty of a disparity step of 1 px, in units of the cost (1.5 per bit of census that differs)",
+        "penalty of a disparity step of 1 px, in units of the cost (1.5 per differing census bit)",
         low=0,
         high=100,
     )
@@ -85,10 +85,10 @@ class Match(Stage):
         100, "penalty of a larger step where the image has no edge; above p1", low=0, high=MAX_BYTE - MAX_COST
     )
     unseen_cost: int = parameter(
-        40, "cost of a partner outside the right image. A match without a good prior needs more, or it prefers such "
-        "partners to those of near ground", low=0, high=MAX_COST,
+        40, "cost of a match outside the right image. Without a good prior it must be larger, or such matches win over "
+        "those of near ground", low=0, high=MAX_COST,
     )  # fmt: skip
-    uniqueness: int = parameter(0, "margin by which the best sum of paths must beat the next", low=0, high=254)
+    uniqueness: int = parameter(0, "margin by which the best path sum must beat the next", low=0, high=254)
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
     max_speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
@@ -100,11 +100,10 @@ class Match(Stage):
         "ground that they hide",
     )  # fmt: skip
     denoise: bool = parameter(
-        False, "remove noise beyond 1.25 gray levels, as the image and the prior show it, from the images to match"
+        False, "remove noise above 1.25 gray levels before the match; image and prior determine its level"
     )  # fmt: skip
     search_radius: int = parameter(
-        0, "distance from the prior that is searched at least; pixels without a prior are not searched; 0: the whole"
-        " range everywhere",
+        0, "smallest distance searched around the prior; pixels without a prior are not searched; 0: the whole range",
         unit="px", low=0, high=64,
     )  # fmt: skip
     band_height: int = parameter(
@@ -112,21 +111,21 @@ class Match(Stage):
         unit="px", low=0,
     )  # fmt: skip
     out_of_range: str = parameter(
-        "unknown", "pixels that the prior has nearer than the range: unknown, or copied from the prior",
+        "unknown", "pixels whose prior is nearer than the search range: unknown, or copied from the prior",
         choices=("unknown", "prior"),
     )  # fmt: skip
     max_prior_step: float = parameter(
-        0.0, "rows of near ground are copied from the prior: those where a pixel of half size is at most such a step "
-        "of depth; 0: none", unit="m", low=0,
+        0.0, "depth step of a pixel at half size up to which rows of near ground are copied from the prior; 0: none",
+        unit="m", low=0,
     )  # fmt: skip
     max_prior_depth: float = parameter(
-        0.0, "with `max_prior_step`, rows wholly beyond this depth are copied from the prior as well; 0: none",
+        0.0, "with `max_prior_step`, depth beyond which rows are copied from the prior as well; 0: none",
         unit="m", low=0,
     )  # fmt: skip
     keep_costs: bool = parameter(
-        False, "keep the smallest sums of costs of each pixel in the result; a run with a recording sets it"
+        False, "keep the lowest path sums of each pixel in the result; a run with a recording sets it"
     )
-    threads: int = parameter(1, "most cores for one frame (two are used); never changes the result", low=1)
+    threads: int = parameter(1, "largest number of cores for a frame (two are used); same result", low=1)
     max_memory: int = parameter(
         400, "memory for the sums of paths; larger frames are matched in stripes, with the same result",
         unit="MB", low=1,

@@ -54,7 +54,7 @@ class MatchOpenCV(Stage):
     block_size: int = parameter(
         3, "side of the block that a matching cost is summed over, odd", unit="px", low=1, high=9
     )
-    p1: float = parameter(2.0, "penalty of a step of 1 px, times channels * block^2 (as the paper's authors)", low=0.1)
+    p1: float = parameter(2.0, "penalty of a step of 1 px, times channels * block^2 (as in the authors' code)", low=0.1)
     p2: float = parameter(24.0, "penalty of a larger step, times channels * block^2; above p1", low=0)
     prefilter_cap: int = parameter(
         63, "largest horizontal gradient that the matching cost distinguishes, gray levels", low=1, high=63

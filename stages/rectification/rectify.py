@@ -55,7 +55,7 @@ class Rectify(Stage):
 
     row_offset: float | tuple[float, ...] | None = parameter(
         None,
-        "rows by which a point lies lower in the left rectified image than in the right one (v_left - v_right); the"
+        "rows by which a point is lower in the left rectified image than in the right one (v_left - v_right); the"
         " right image is moved down by them. A number, or the weights of 1, x, y, xy, y^2 (from the centre, in widths"
         " and heights); default: measured, and corrected if the evidence is clear",
         unit="px",

@@ -92,14 +92,14 @@ class Refine(Stage):
     min_superpixel_size: int = parameter(
         300, "smallest mean size of a superpixel; a small image gets fewer superpixels", unit="px", low=1
     )
-    surface_size: int = parameter(16, "superpixels in a region, the larger support of planes; 0: none", low=0)
+    surface_size: int = parameter(16, "superpixels in a surface, to which planes are fitted too; 0: none", low=0)
     hypotheses: int = parameter(16, "planes tried in each segment", low=1)
     plane_weight: float = parameter(0.5, "weight of the plane against a match near it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: bool = parameter(True, "whether the remaining holes are filled from the background")
     bridge: bool = parameter(
-        True, "whether a hole that both cameras see takes a line between its ends, where the images contradict its "
-        "filling; ground has flanks, rooms have steps",
+        True, "whether a straight line between its ends fills a hole that both cameras see, if the images contradict "
+        "the other filling; for ground, not for rooms",
     )  # fmt: skip
     bilateral_radius: int = parameter(
         3, "radius and spatial sigma of the bilateral filter; 0: none", unit="px", low=0, high=32
@@ -108,10 +108,10 @@ class Refine(Stage):
         3, "radius of the windows that move depth edges to where the images have them; 0: none", unit="px", low=0,
         high=16,
     )  # fmt: skip
-    support: bool = parameter(True, "whether matches of weak texture move to the planes of windows that grow")
+    support: bool = parameter(True, "whether matches of weak texture move towards planes of growing windows")
     min_support_shift: float = parameter(
-        0.0, "for a guide: support that moves a match by less is left out, so that the errors of neighbours stay "
-        "independent; sigma stays that of the support; needs `support`", unit="px", low=0,
+        0.0, "for a guide: smallest shift by support that is applied; without small ones the errors of neighbours stay "
+        "independent; sigma is that of the support; needs `support`", unit="px", low=0,
     )  # fmt: skip
     min_correlation: float = parameter(
         0.4,

@@ -45,24 +45,24 @@ class Binarise(Stage):
 
     method: str = parameter("rover", "hazard rule", choices=("rover", "absolute"))
     rover: Rover = parameter(Rover(), "the vehicle; `absolute` compares elevations with its max_step")
-    max_roughness: float = parameter(0.06, "RMS of heights off their plane that is free", unit="m", low=0.0)
+    max_roughness: float = parameter(0.06, "largest RMS of heights off their plane on free ground", unit="m", low=0.0)
     height_margin: float = parameter(
-        0.03, "a height this close to its limit counts as reaching it, because cells blunt a peak", unit="m", low=0.0
+        0.03, "a height this close to its limit counts as reaching it, because cells flatten peaks", unit="m", low=0.0
     )
     hazard_margin: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
     max_sigma: float = parameter(
-        0.067, "standard deviation of a cell's height that may be free (a third of a step)", unit="m", low=0.0
+        0.067, "largest standard deviation of the height of a free cell (a third of a step)", unit="m", low=0.0
     )
     min_drop: float = parameter(
-        0.1, "depth of hidden ground below its surroundings from which it may be a drop; of a ditch only a part "
-        "of the depth is measurable", unit="m", low=0.0,
+        0.1, "depth below its surroundings from which hidden ground may be a drop; only part of a ditch's depth is "
+        "measurable", unit="m", low=0.0,
     )  # fmt: skip
     min_rise: float = parameter(
-        0.05, "height above the ground at the edge of view from which an obstacle may go on out of view; of a step "
-        "twice as much", unit="m", low=0.0,
+        0.05, "height above the ground, at the edge of view, from which an obstacle may continue out of view; for a "
+        "step, twice as much", unit="m", low=0.0,
     )  # fmt: skip
     steepness_error: float = parameter(0.25, "relative error of the difference between steepness and slope", low=0.0)
-    min_points: int = parameter(1, "points of a free cell, if the map counts them", low=1)
+    min_points: int = parameter(1, "smallest number of points of a free cell, if the map counts points", low=1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -53,7 +53,7 @@ class Voxelise(Stage):
         "without points; 0 = none", low=0.0,
     )  # fmt: skip
     max_splat: float = parameter(
-        0.08, "longest reach in depth; behind depth edges, where depth is least certain, the ground is hidden",
+        0.08, "longest reach in depth; behind depth edges, where depth is most uncertain, the ground is hidden",
         unit="m", low=0.0,
     )  # fmt: skip
     filled: str = parameter(

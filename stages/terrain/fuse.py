@@ -79,7 +79,7 @@ class _Fusion(Stage):
         """
         last = maps[-1]
         if abs(last.resolution / self.resolution - 1) > 1e-6:
-            raise ValueError(f"the map of the log has cells of {last.resolution:g} m, not {self.resolution:g} m")
+            raise ValueError(f"the logged map has cells of {last.resolution:g} m, not {self.resolution:g} m")
         state = FusedMap(last.frame_id, last.epoch or 0, last.stamp, "ceiling" in last.layers, logged=last.level)
         for part in maps:
             if (part.frame_id, part.epoch) == (last.frame_id, last.epoch):
@@ -117,8 +117,8 @@ class _Fusion(Stage):
         apart = math.inf if logged is None else math.dist(level.translation[:2], logged.translation[:2])
         if logged is None or cloud.stamp != state.last or apart > self.resolution:
             raise StageError(
-                f"{type(self).__name__}: the frame of {state.last} ns, the last one in the map of the log, has no "
-                "cloud, or its pose is more than a cell off its place there"
+                f"{type(self).__name__}: the frame of {state.last} ns, the last one in the logged map, has no "
+                "cloud, or its pose is more than a cell off that map"
             )
         plane, sigma = plane_between(level, logged), cloud.tilt_sigma or self.tilt_sigma
         levelling = MapLevelling.begin(pose, self._stated).tilted(up, sigma).placed()
@@ -147,7 +147,7 @@ class _Fusion(Stage):
         check_level(self, cloud)
         if cloud.sensor is None:
             raise StageError(
-                f"{type(self).__name__}: the cloud lacks its camera's place, `sensor`; stages.Level adds it"
+                f"{type(self).__name__}: the cloud lacks its camera's pose, `sensor`; stages.Level adds it"
             )
         if cloud.stamp <= state.last and state.logged is None:
             raise StageError(

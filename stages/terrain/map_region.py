@@ -1,7 +1,7 @@
-"""MapRegion: the elevation map around the rover, once for each step that it has driven.
+"""MapRegion: the elevation map around the rover, once for each step driven.
 
 The layers of a map, and the features and the navigation map after it, cost more than fusing a frame. A map contains
-what the frames before it changed, so few are enough.
+the changes of all frames before it, so few maps are enough.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class MapProgress:
 
 @dataclass(frozen=True)
 class MapRegion(Stage):
-    """Returns the map around the rover if it has moved on by `step`, else None; and one with the last frame.
+    """Returns the map around the rover each time it has moved by `step`, and with the last frame; else None.
 
     The map is a square of `window` around the rover with its sides along the axes of the pose's frame, and larger where
     frames since the last map changed more. So the maps of a run laid over each other are the whole region. Where the
@@ -55,8 +55,8 @@ class MapRegion(Stage):
     """
 
     step: float = parameter(
-        0.0, "way of the rover, or of the place 4 m ahead of it, from one map to the next; 0: a map a frame", unit="m",
-        low=0.0, high=5.0,
+        0.0, "distance moved by the rover, or by the point 4 m ahead of it, from map to map; 0: a map for every frame",
+        unit="m", low=0.0, high=5.0,
     )  # fmt: skip
     window: float = parameter(20.0, "width of the map", unit="m", low=0.5, high=200.0)
 

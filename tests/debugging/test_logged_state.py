@@ -85,7 +85,7 @@ def test_the_state_is_reported(run, tmp_path, said):
     output = said(0, "try", log, "--at", AT, "--result", result, *change).out
     assert "1 frame from 1.534 s on, after 1 frame before it" in output
     streams = "regional_cells" if log.name == "traverse.mcap" else "motion, pose, regional_cells"
-    assert f"state of {streams}, regional_cells@B from {result}, of 22:13:20.513 (1700086400513000000 ns)" in output
+    assert f"state of {streams}, regional_cells@B from {result} at 22:13:20.513 (1700086400513000000 ns)" in output
     assert "the log rounds its heights to 1 mm and its variances to 1 %" in output
     assert "(a result log does not contain it)" in output
     assert f"A: the run of {result}" in output
@@ -95,7 +95,7 @@ def test_the_state_is_reported(run, tmp_path, said):
 def test_cells_of_another_size_begin_without_a_state(run, tmp_path, said):
     log, result = run
     change = ("--set", "resolution=10 cm", "-o", tmp_path / "try.rrd")
-    reason = "the map of the log has cells of 0.05 m, not 0.1 m"
+    reason = "the logged map has cells of 0.05 m, not 0.1 m"
     output = said(0, "try", log, "--at", AT, "--result", result, *change).out
     assert f"without state: regional_cells@B ({reason})" in output
 

@@ -99,9 +99,9 @@ def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):
     cut.write_bytes(result.read_bytes()[: result.stat().st_size // 2])
     assert roverflow("report", cut) == 0
     text = " ".join(Page(cut.with_suffix(".html").read_text()).words)
-    assert "the log was cut before its verdict" in text
+    assert "the log is truncated before its verdict" in text
     assert "No loss is recorded before the log ends." in text
-    assert re.search(r"unreadable the log is cut or damaged at byte \d+", text)
+    assert re.search(r"unreadable the log is truncated or damaged at byte \d+", text)
 
 
 def test_two_results_stand_beside_each_other(traverse, result, tmp_path):
@@ -133,7 +133,7 @@ def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, refuse
     row = f"<td>left</td><td>{moment(1700086400513000000)}</td><td>unmatched</td>"
     assert row in out.with_suffix(".html").read_text()
     out.with_suffix(".html").write_text("my own page")
-    assert "exists and is no report of roverflow" in refused("report", out)
+    assert "exists and is not a roverflow report" in refused("report", out)
     assert "is not a result log" in refused("report", traverse)
     for several in ((tmp_path, out), (out, tmp_path), (out, out, out)):
         assert "give one or two result logs, or the folder of one fleet" in refused("report", *several)

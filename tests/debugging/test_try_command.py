@@ -36,7 +36,7 @@ def test_stages_before_the_change_run_once(traverse, tmp_path, said, monkeypatch
     out = tmp_path / "try.rrd"
     change = ("--set", "navigation_map.rover.max_step=5 cm", "-o", out)
     output = said(0, "try", traverse, *AT, "--frames", 2, *change).out
-    assert "stages run once, 1 again with the change\nthe change touches navigation_map\n\nA: fast as it is\n" in output
+    assert " run once, 1 again with the change\nthe change affects navigation_map\n\nA: fast, unchanged\n" in output
     first = re.search(r"the results first differ at /nav/navigation_map, (\S+) \((\d+) ns\)\n", output)
     assert first is not None
     assert first[0].endswith(f"{moment(int(first[2]))}\n")
@@ -107,7 +107,7 @@ def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_p
     assert "2 frames from 0.534 s on: " in output
     assert "\nnote: 1 frame gave no result; roverflow run --start " in output
     why = refused("try", log, "--at", "1.05", *words)
-    assert "no frame went through at 1.034 s: left unmatched; roverflow run --start " in why
+    assert "no frame was completed at 1.034 s: left unmatched; roverflow run --start " in why
 
 
 def test_a_comparison_ends_before_the_disk_is_full(traverse, tmp_path, said, monkeypatch):

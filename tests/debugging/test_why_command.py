@@ -111,9 +111,9 @@ def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, s
     for _ in range(2):  # the second picture replaces the first
         output = said(0, "why", fast_result, "--at", AT, f"--cell={x},{y}", *log, "-o", out).out
     assert f"cell ({x:.3f}, {y:.3f}) m at {moment(stamp)}: hazard, reason " in output
-    assert re.search(r"\n  step .*; limit 0.17 m = rover.max_step 0.2 - height_margin 0.03\n", output)
+    assert re.search(r"\n  step .* the limit 0.17 m \(rover.max_step 0.2 - height_margin 0.03\)\n", output)
     assert "\n  drop                     none (only hidden cells have one)\n" in output
-    assert re.search(r"\n(free|unknown) with navigation_map\.[a-z_.]+ = ", output)
+    assert re.search(r"\nwould be (free|unknown) with navigation_map\.[a-z_.]+ = ", output)
     assert "\npixels: " in output
     assert re.search(r"\nsearch: lowest cost \d+ to \d+, median \d+; lead over the next \d+ to \d+, median ", output)
     picture = cv2.imread(str(out)).astype(int)
@@ -123,11 +123,11 @@ def test_the_command_prints_limits_and_draws_the_pixels(traverse, fast_result, s
 def test_the_nearest_cell_of_fast_was_not_searched_at_full_size(traverse, fast_result, tmp_path, said, stamp):
     (x, y), *_ = places(fast_result, stamp, Cell.FREE, 1)
     words = ("why", fast_result, "--at", AT, f"--cell={x},{y}", "--log", traverse, "-o", tmp_path / "why.png")
-    assert "\nsearch: no cost below 255: not searched at full size, or nothing alike was found\n" in said(0, *words).out
+    assert "\nsearch: no cost below 255: not searched at full size, or no match was found\n" in said(0, *words).out
 
 
 @pytest.mark.parametrize(("words", "why_not"), [
-    (("--cell", "1,1"), "traverse.mcap, is not beside it; give it with --log"),
+    (("--cell", "1,1"), "traverse.mcap, is not in its folder; give it with --log"),
     (("--cell", "99,1", "--log"), "is outside the map, which has x "),
     (("--pixel", "999,1", "--log"), "is outside the image of 320x240"),
     (("--cell", "1,1", "--map", "nix", "--log"), "navigation map 'nix', only navigation_map, regional_navigation_map"),
@@ -203,7 +203,7 @@ def test_a_log_of_other_stamps_is_not_taken_for_the_input(traverse, fast_result,
 def test_a_log_of_the_same_stamps_and_other_content_is_noted(traverse, fast_result, tmp_path, said, refused):
     other, none = rewrite(traverse, tmp_path / "other.mcap", lambda *one: one[2], chunk_size=1 << 16), tmp_path / "none"
     words = ("why", fast_result, "--at", AT, "--cell", "3,0", "--log")
-    noted = f"note: {other} is another form of the input of {fast_result}, or another log with its stamps\n"
+    noted = f"note: {other} has other bytes than the input of {fast_result}, but the same stamps\n"
     assert noted in said(0, *words, other).out
     assert f"there is no log {none}, which --log names\n" in refused(*words, none)
 
@@ -214,7 +214,7 @@ def test_a_result_that_was_cut_is_said_to_be_incomplete(traverse, fast_result, s
     words = ("--at", 0.6, "--cell", "3,0", "--log", traverse)
     cut.write_bytes(data[: int(share * len(data))])
     notes = [line for line in said(0, "why", cut, *words).out.splitlines() if line.startswith("note: ")]
-    why = "its end is missing" if share > 0.99 else "the log is cut or damaged"
+    why = "its end is missing" if share > 0.99 else "the log is truncated or damaged"
     assert [note.partition(" at byte ")[0] for note in notes] == [f"note: {cut} is incomplete: {why}"]
     assert "note: " not in said(0, "why", fast_result, *words).out
 

@@ -31,8 +31,8 @@ COMMANDS_INTRO = """# Command line
 
 This page is generated from the code by `make docs`. `roverflow COMMAND --help` prints the same.
 
-`python -m flow` is another name of `roverflow`. Every command accepts `--debug`, which shows tracebacks.
-[results.md](results.md#exit-codes) lists the exit codes.
+`python -m flow` is another name of `roverflow`. Every command accepts `--debug`, which prints tracebacks.
+Defaults are in parentheses. [results.md](results.md#exit-codes) lists the exit codes.
 """
 
 

@@ -97,7 +97,7 @@ def test_a_scheduler_that_is_killed_is_continued_by_the_same_command(home, tmp_p
         scheduler.kill()
         said = fleet.communicate(timeout=LIMIT)[1]
     assert fleet.returncode == 3
-    assert "the same command continues" in said
+    assert "run the same command again to continue" in said
     assert "Traceback" not in said
     before = times(out)
     assert 2 <= len(before) < 12
@@ -137,7 +137,7 @@ def test_a_client_that_is_killed_is_continued_by_the_same_command(home, tmp_path
     fleet.send_signal(signal.SIGKILL)
     fleet.communicate()
     assert not psutil.wait_procs(workers, timeout=LIMIT)[1]
-    assert "left; the same command continues" in watch.communicate(timeout=LIMIT)[0]
+    assert "left; run its command again to continue" in watch.communicate(timeout=LIMIT)[0]
     assert watch.returncode == 3
     before = times(out)
     assert len(before) >= 2

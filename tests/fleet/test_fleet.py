@@ -138,7 +138,7 @@ def test_a_log_keeps_its_name_and_no_other_log_takes_it(logs, tmp_path):
     (moved / "c.mcap").write_bytes(first.log.read_bytes())
     assert [job.name for job in jobs_of([str(moved)], tmp_path, [row])] == ["c"]
     (moved / "c.mcap").write_bytes((logs / "b.mcap").read_bytes())
-    with pytest.raises(UsageError, match=r"has results of .*site/c.mcap by the name c; choose another --out"):
+    with pytest.raises(UsageError, match=r"has results of .*site/c.mcap under the name c; choose another --out"):
         jobs_of([str(moved)], tmp_path, [row])
 
 
@@ -159,7 +159,7 @@ def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, said):
     catalogue = Catalogue(tmp_path, create=True)
     catalogue.put("a", {"state": "running", "bytes": 9})
     printed = said(3, "fleet", "--out", tmp_path, "--watch").out
-    assert "no process runs this fleet, 1 log left; the same command continues" in printed
+    assert "no process runs this fleet, 1 log left; run its command again to continue" in printed
 
 
 def test_a_worker_that_stays_forgets_the_stages_of_an_earlier_fleet(logs, tmp_path):

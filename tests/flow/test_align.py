@@ -159,9 +159,9 @@ def test_a_gap_longer_than_the_patience_is_a_gap_for_every_frame_in_it():
     messages = by_stamp([(at * MS, 0.0) for at in (50, 1450)], [at * MS for at in (100, 900, 1500)])
     details = [answer.value.cause.detail for answer in sampling(Interpolate(), *messages)]
     assert details == [
-        "no level sample after it within 1 s of log time (tilt.patience); the last is 50 ms before it",
+        "no later level sample within 1 s of log time (tilt.patience); the last is 50 ms earlier",
         "level has a gap of 1.4 s, more than 1.2 s (tilt.max_gap)",
-        "no level sample after it by the log's end; the last is 50 ms before it",
+        "no later level sample by the log's end; the last is 50 ms earlier",
     ]
 
 

@@ -26,7 +26,7 @@ MAPS_MB = 3  # pictures and exported maps
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     """Declare the options."""
     sub.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder for the results (demo)")
-    sub.add_argument("--frames", type=count, default=8, metavar="N", help="frames to simulate (8)")
+    sub.add_argument("--frames", type=count, default=8, metavar="N", help="number of frames to simulate (8)")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -23,16 +23,16 @@ HELP = "write the maps of a result log as GeoTIFF, PGM with YAML (map_server), P
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     several = "result log; several of them, or the folder of a fleet, with --merge"
     sub.add_argument("results", type=Path, nargs="+", metavar="OUT.mcap", help=several)
-    sub.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, made where it is missing")
-    sub.add_argument("--frames", action="store_true", help="maps and points of every frame, not the regional map")
+    sub.add_argument("folder", type=Path, metavar="DIR", help="folder for the files, created if missing")
+    sub.add_argument("--frames", action="store_true", help="write maps and points of every frame, not the regional map")
     sub.add_argument(
         "--map", action="append", default=[], metavar="STREAM", dest="maps",
-        help="an elevation or navigation map of the pipeline by its stream's name, not the regional one",
+        help="write the elevation or navigation map of this stream, not the regional map",
     )  # fmt: skip
-    sub.add_argument("--crs", metavar="CRS", help="place the regional map by GNSS fixes: utm, or a zone as EPSG:32633")
-    fixes = "log with the fixes: files or a folder (the result itself, or its input beside it)"
+    sub.add_argument("--crs", metavar="CRS", help="georeference the regional map by fixes: utm, or a zone (EPSG:32633)")
+    fixes = "log with the GNSS fixes: files or a folder (the result itself, or its input beside it)"
     sub.add_argument("--fixes", type=Path, nargs="+", metavar="LOG", help=fixes)
-    one_map = "merge the regional maps of several logs, whose poses are in one frame, into one"
+    one_map = "merge the regional maps of several logs into one; their poses must be in one frame"
     sub.add_argument("--merge", action="store_true", help=one_map)
 
 
@@ -42,7 +42,7 @@ def run(options: argparse.Namespace) -> int:
     if options.folder.exists() and not options.folder.is_dir():
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
-        raise UsageError(f"{options.folder} is not empty, and maps of two runs must not mix; choose another folder")
+        raise UsageError(f"{options.folder} is not empty; choose another folder, because maps of two runs must not mix")
     lost, made = Counter[str](), not options.folder.exists()
     try:
         with writing(options.folder):
@@ -86,7 +86,7 @@ def _places(options: argparse.Namespace, result: Path) -> dict[str, Georeference
     from recordings.scoring.result_log import input_beside
 
     if options.frames:
-        raise UsageError("--crs places regional maps; leave out --frames")
+        raise UsageError("--crs georeferences regional maps only; leave out --frames")
     beside = input_beside(result)
     logs = [options.fixes] if options.fixes else [[result], *([beside] if beside[0].exists() else [])]
     places = georeferences(result, logs, options.crs)
@@ -102,7 +102,7 @@ def _results(options: argparse.Namespace) -> list[Path]:
             raise UsageError("export takes one result log and a folder; add --merge to merge the maps of several logs")
         return list(options.results)
     if options.frames or options.maps:
-        raise UsageError("--merge merges regional maps; leave out --frames and --map")
+        raise UsageError("--merge merges regional maps only; leave out --frames and --map")
     from flow.cli.fleet.catalogue import Catalogue
 
     results: list[Path] = []

@@ -23,22 +23,22 @@ HELP = "run many logs through a pipeline, and keep a catalogue of their results"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    logs = "logs, folders of logs, patterns, or text files that list them"
+    logs = "logs, folders of logs, glob patterns, or text files that list them"
     sub.add_argument("logs", nargs="*", metavar="LOG", help=logs)
-    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results and the catalogue")
+    sub.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results and the catalogue")
     add_pipeline_options(sub)
     sub.add_argument("--rrd", action="store_true", help="write a rerun recording beside each result")
     one = "threads of each log; a process runs one log at a time (2)"
     sub.add_argument("--workers-per-log", type=workers, default=2, metavar="N", help=one)
     sub.add_argument("--processes", type=workers, metavar="N", help="worker processes (cores / workers per log)")
-    ends = "memory at which a worker process ends (4GB)"
+    ends = "memory limit of a worker process, which is ended beyond it (4GB)"
     sub.add_argument("--memory", type=memory, default="4GB", metavar="SIZE", help=ends)
-    address = "scheduler of a Dask cluster that exists, tcp://... or tls://..."
+    address = "address of the scheduler of a running Dask cluster, tcp://... or tls://..."
     sub.add_argument("--cluster", metavar="ADDRESS", help=address)
     sub.add_argument("--dashboard", action="store_true", help="show Dask's dashboard on http://127.0.0.1:8787")
-    stall = "a log without a new frame for that long counts as hung (600)"
+    stall = "time without a new frame after which a log counts as hung (600)"
     sub.add_argument("--stall", type=count, default=600, metavar="SECONDS", help=stall)
-    sub.add_argument("--watch", action="store_true", help="show the fleet of --out that another terminal runs")
+    sub.add_argument("--watch", action="store_true", help="show the progress of the fleet that runs in --out")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     if options.watch:
         return watch(Catalogue(options.out))
     if not options.logs:
-        raise UsageError("give logs, folders, patterns or a text file of them")
+        raise UsageError("give logs, folders, glob patterns or a text file that lists them")
     if options.out.is_file():
         raise UsageError(f"{options.out} is a file; give the name of a folder")
     load(options.pipeline, options.set)

@@ -21,7 +21,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     add_log(sub)
     add_pipeline_options(sub)
     sub.add_argument("--json", action="store_true", help="print JSON")
-    written = "write the pipeline with the topics found, and what is missing as comments"
+    written = "write the pipeline with the topics found; comments list what is missing"
     sub.add_argument("--write-pipeline", type=Path, metavar="FILE", help=written)
 
 

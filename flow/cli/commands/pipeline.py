@@ -7,11 +7,11 @@ import argparse
 from flow.cli.report import say
 from flow.errors import COMPLETE
 
-HELP = "print the file of a pipeline or of one of its templates: roverflow pipeline rover > mine.yaml"
+HELP = "print the YAML of a pipeline or of a template: roverflow pipeline rover > mine.yaml"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("name", metavar="NAME", help="a pipeline, a template such as rover_disparity, or a file")
+    sub.add_argument("name", metavar="NAME", help="a pipeline, a template such as rover_disparity, or a YAML file")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -29,19 +29,19 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "--profile",
         choices=("ros2", "foxglove"),
-        help="messages of the result log (ros2); score, export, diff and report read only ros2",
+        help="message types of the result log (ros2); score, export, diff and report read only ros2",
     )
     sub.add_argument(
-        "--with-inputs", action="store_true", help="copy the messages of the log into the result log, byte for byte"
+        "--with-inputs", action="store_true", help="copy the input messages into the result log, byte for byte"
     )
     recording = sub.add_mutually_exclusive_group()
     recording.add_argument("--rrd", type=Path, metavar="OUT.rrd", help="rerun recording (beside the result log)")
     recording.add_argument("--no-rrd", action="store_true", help="write no rerun recording")
-    sub.add_argument("--desk", choices=DESKS, help="layout that the viewer opens the recording with (overview)")
+    sub.add_argument("--desk", choices=DESKS, help="viewer layout that the recording opens with (overview)")
     watching = sub.add_mutually_exclusive_group()
     watching.add_argument("--view", action="store_true", help="open the viewer and watch the run")
     watching.add_argument(
-        "--serve", action="store_true", help="serve the run to a browser of this machine while it lasts"
+        "--serve", action="store_true", help="show the run in a browser on this machine until it ends"
     )
     sub.add_argument("--start", type=seconds, metavar="T", help="begin T seconds after the log's first message")
     sub.add_argument("--end", type=seconds, metavar="T", help="stop T seconds after the log's first message")
@@ -49,10 +49,10 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         "--every",
         type=every,
         metavar="N|LENGTH",
-        help="take every N-th stereo frame, or one for each LENGTH driven by the log's odometry, such as 0.5m (1)",
+        help="take every N-th stereo frame, or one per LENGTH driven, such as 0.5m, by the log's odometry (1)",
     )
     sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
-    sub.add_argument("--summary", type=Path, metavar="OUT.json", help="counts, losses, times and verdict as JSON")
+    sub.add_argument("--summary", type=Path, metavar="OUT.json", help="write counts, losses, times and verdict as JSON")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -66,7 +66,7 @@ def run(options: argparse.Namespace) -> int:
     outputs = {"result log": out, "recording": rrd, "summary": options.summary}
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve):
-        raise UsageError("watching needs the recording; leave out --no-rrd")
+        raise UsageError("--view and --serve need the recording; leave out --no-rrd")
     names = ("workers", "start", "end", "every", "profile", "desk", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:

@@ -17,7 +17,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log, or the folder of a fleet")
     truth = "log with the /truth topics: files or a folder (the result itself)"
     sub.add_argument("--truth", type=Path, nargs="+", metavar="LOG", help=truth)
-    sub.add_argument("--json", type=Path, metavar="FILE", help="write every figure as JSON")
+    sub.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -18,7 +18,7 @@ HELP = "list stages, aligners, source and sinks; with a name, its inputs and par
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("name", nargs="?", metavar="NAME", help="such as Match, my_module.Stage or Disparity")
+    sub.add_argument("name", nargs="?", metavar="NAME", help="stage or data type, such as Match or Disparity")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -22,20 +22,20 @@ if TYPE_CHECKING:
     from recordings.comparison.recording import DiffRecording
     from recordings.comparison.sweep import Sweep
 
-HELP = "run one instant of a log with and without a change of the pipeline, and compare"
+HELP = "run one instant of a log with and without a pipeline change, and compare the results"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     add_log(sub)
     sub.add_argument("--at", type=instant, required=True, metavar="T", help=AT)
-    sub.add_argument("--frames", type=count, default=1, metavar="N", help="frames from that instant on (1)")
-    before = "frames before it, for the stages with memory: regional map, pose, tilt check (0)"
+    sub.add_argument("--frames", type=count, default=1, metavar="N", help="number of frames from that instant on (1)")
+    before = "frames to run before it, for stages with state: regional map, pose, tilt check (0)"
     state = sub.add_mutually_exclusive_group()
     state.add_argument("--before", type=count_or_none, default=0, metavar="N", help=before)
-    logged = "result log of the whole run: regional map and pose begin as it has them, and its pipeline is A"
+    logged = "result log of the whole run: supplies pipeline A, and the regional map and pose to begin with"
     state.add_argument("--result", type=Path, metavar="OUT.mcap", help=logged)
     sub.add_argument("-p", "--pipeline", help="rover, fast, accurate, paper, or a YAML file (rover)")
-    several = "the change; several values of one parameter are compared one by one"
+    several = "the change; repeat it with other values of one parameter to compare them all"
     sub.add_argument("--set", action="append", default=[], required=True, metavar="STREAM.PARAM=VALUE", help=several)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.rrd", help="recording of the comparison (LOG-try.rrd)")
     sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     from flow.cli.debugging.what_if import changes_of, run_variants, summary_lines, swept_setting
 
     changes, pipeline = changes_of(options.set), result or options.pipeline or "rover"
-    unchanged = f"A: {pipeline} as it is" if result is None else f"A: the run of {result}"
+    unchanged = f"A: {pipeline}, unchanged" if result is None else f"A: the run of {result}"
     at, frames, before = without_cursor(options.at), options.frames, options.before
     with TemporaryDirectory(prefix="roverflow-try-") as folder:
         paths, variants, part, notes = run_variants(

@@ -11,13 +11,13 @@ from flow.errors import COMPLETE, UsageError
 from recordings.atomic_write import written
 from recordings.sinks import DESKS
 
-HELP = "write layouts of a recording, one for each kind of question"
+HELP = "write viewer layouts for a recording, one for each kind of question"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("recording", type=Path, metavar="OUT.rrd", help="recording of roverflow run")
-    sub.add_argument("--desk", action="append", choices=DESKS, help="one of the layouts (all of them)")
-    sub.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the files (that of the recording)")
+    sub.add_argument("--desk", action="append", choices=DESKS, help="layout to write (all of them)")
+    sub.add_argument("--out", type=Path, metavar="FOLDER", help="folder for the layout files (that of the recording)")
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Why a cell of a navigation map has its verdict: its pixels, layers, limits and the changes that would turn it.
+"""Why a cell of a navigation map has its verdict: its pixels, layers, limits and the settings that would change it.
 
 The frame is run again from the input log, so that every intermediate is there. The verdicts are compared with those of
 the result.
@@ -66,7 +66,7 @@ class CellExplanation:
     doubts : list of str
         Of a cell that is UNSURE: why it is not free, though it exceeds no limit.
     turns : list of Turn
-        The smallest change of each parameter that would turn the verdict.
+        The smallest change of each parameter that would change the verdict.
     notes : list of str
         What differs from the question: another form of the input log, another instant.
     """

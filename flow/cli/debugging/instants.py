@@ -82,7 +82,7 @@ def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
     details = ("" if entry["reason"] == LossReason.UNMATCHED else f" ({entry['detail']})" for entry in lost)
     losses = [f": {entry['stream']} {entry['reason']}{detail}" for entry, detail in zip(lost, details, strict=True)]
     begin = f"roverflow run --start {part.first:.3f} says why"
-    return UsageError(f"no frame went through at {part.at:.3f} s{''.join(losses[:1])}; {begin}")
+    return UsageError(f"no frame was completed at {part.at:.3f} s{''.join(losses[:1])}; {begin}")
 
 
 def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:

@@ -105,7 +105,7 @@ def resume(
         return 0, {}, [*notes, none]
     states, without = logged.states(graphs, variants)
     sink: Any = sink_of(graphs["A"], ".mcap")
-    notes.append(f"state of {', '.join(states) or 'no stage'} from {result}, of {moment(logged.stamp)}")
+    notes.append(f"state of {', '.join(states) or 'no stage'} from {result} at {moment(logged.stamp)}")
     if logged.maps and sink.length_step:
         step = 1e3 * sink.length_step
         notes[-1] += f"; the log rounds its heights to {step:.1g} mm and its variances to {100 * sink.precision:g} %"

@@ -9,14 +9,14 @@ from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE, UsageError
 
-HELP = "write one HTML page about a result log, two beside each other, or a fleet"
+HELP = "write one HTML page about a result log, about two side by side, or about a fleet"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument(
         "results", nargs="+", type=Path, metavar="OUT.mcap", help="one or two result logs, or the folder of a fleet"
     )
-    sub.add_argument("-o", "--out", type=Path, metavar="OUT.html", help="the page (OUT.html beside the first log)")
+    sub.add_argument("-o", "--out", type=Path, metavar="OUT.html", help="the HTML page (OUT.html beside the first log)")
 
 
 def run(options: argparse.Namespace) -> int:

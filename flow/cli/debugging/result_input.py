@@ -33,7 +33,7 @@ def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = Fa
 
 
 def note_damage(result: Path) -> None:
-    """Say if a result log is incomplete, as a copy that broke off is."""
+    """Print a note if a result log is incomplete, as an interrupted copy is."""
     from recordings.mcap.file import McapFile
 
     with McapFile(result) as log:
@@ -58,7 +58,7 @@ def input_of(
         given = [Path(log)] if isinstance(log, Path | str) else [*map(Path, log)]
     for file in given:
         if not file.exists():
-            missing = f"the input of {result}, {named}, is not beside it; give it with --log"
+            missing = f"the input of {result}, {named}, is not in its folder; give it with --log"
             raise UsageError(missing if log is None else f"there is no log {file}, which --log names")
     with ExitStack() as stack:
         try:
@@ -83,5 +83,5 @@ def check_input(opened: McapLog, given: Sequence[Path], result: Path, remedy: st
     names = ", ".join(map(str, given))
     if is_other(opened, stamps_of(result)):
         raise UsageError(f"{names} is not the input of {result}: its frames have other stamps{remedy}")
-    note = f"note: {names} is another form of the input of {result}, or another log with its stamps"
+    note = f"note: {names} has other bytes than the input of {result}, but the same stamps"
     return [] if digest is None else [note]

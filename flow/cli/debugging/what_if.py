@@ -115,7 +115,7 @@ def summary_lines(variants: Variants, part: Part) -> list[str]:
     ran = f"{counted(once, 'stage')} run once, {len(again)} again with the {change}"
     return [
         f"{counted(part.frames, 'frame')} from {part.at:.3f} s on{before}: {ran}",
-        f"the change touches {', '.join(dict.fromkeys(again)) or 'no stage'}",
+        f"the change affects {', '.join(dict.fromkeys(again)) or 'no stage'}",
     ]
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from flow.cli.debugging.regional_explanation import RegionalExplanation
     from stages.terrain.verdict_limits import Limit, Turn
 
-HELP = "explain a cell of a navigation map: its pixels, its limits, and what would turn its verdict"
+HELP = "explain a cell of a navigation map: its pixels, its limits, and what would change its verdict"
 MAX_TURNS = 5  # changes of parameters that are listed
 MAX_COST = 255  # of a pixel that was not searched, or that nothing resembles
 
@@ -29,11 +29,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log of a run")
     sub.add_argument("--at", type=instant, required=True, metavar="T", help=AT)
     place = sub.add_mutually_exclusive_group(required=True)
-    place.add_argument("--cell", type=pair, metavar="X,Y", help="place in the map's frame, m")
+    place.add_argument("--cell", type=pair, metavar="X,Y", help="position of the cell in the map's frame, m")
     place.add_argument("--pixel", type=pair, metavar="U,V", help="column and row in the left rectified image")
-    beside = "input of the run, a file or several (what the result names, beside it)"
+    beside = "input of the run, one or more files (the log that the result names, beside it)"
     sub.add_argument("--log", nargs="+", type=Path, metavar="LOG", help=beside)
-    stream = "navigation map (navigation_map)"
+    stream = "stream of the navigation map (navigation_map)"
     sub.add_argument("--map", default="navigation_map", metavar="STREAM", help=stream)
     sub.add_argument("-o", "--out", type=Path, metavar="OUT.png", help="picture with the cell's pixels (OUT-why.png)")
 
@@ -102,7 +102,7 @@ def lines_of(found: Explanation) -> list[str]:
     head = f"cell ({found.x:.3f}, {found.y:.3f}) m at {moment(found.stamp)}: {verdict}, reason {reason}"
     lines = [*found.notes, head]
     if found.recorded is not None and found.recorded != found.verdict:
-        lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or by another version")
+        lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or from another version")
     return [*lines, *_cell_lines(found), *_pixel_lines(found), *_tilt_lines(found)]
 
 
@@ -119,14 +119,14 @@ def _cell_lines(found: Explanation | RegionalExplanation) -> list[str]:
         lines.append("limits:")
         lines += [f"  {name:<24} {_against(name, limit)}" for name, limit in found.limits.items()]
     lines += [f"not free because: {'; '.join(found.doubts)}"] if found.doubts else []
-    turns = [f"{turn.verdict.name.lower()} with {_change(found.stream, turn)}" for turn in found.turns[:MAX_TURNS]]
-    return [*lines, *(turns or ["no single parameter of the hazard rule turns the verdict"])]
+    turns = [f"would be {turn.verdict.name.lower()} with {_change(found.stream, turn)}" for turn in found.turns]
+    return [*lines, *(turns[:MAX_TURNS] or ["no single parameter of the hazard rule changes the verdict"])]
 
 
 def _pixel_lines(found: Explanation) -> list[str]:
     """The pixels and their disparities."""
     if not found.pixels.size:
-        return ["pixels: none of this frame's points lies in the cell"]
+        return ["pixels: no point of this frame lies in the cell"]
     width = found.image.shape[1] if found.image.size else 1
     rows, cols = divmod(found.pixels, width)
     sources = ", ".join(f"{number} {name.lower()}" for name, number in found.sources.items())
@@ -136,7 +136,7 @@ def _pixel_lines(found: Explanation) -> list[str]:
     low, high = found.disparities.min(), found.disparities.max()
     return [
         f"pixels: {found.pixels.size} in {extent}; {sources}",
-        f"disparity: {low:.2f} to {high:.2f} px{sigma}; {found.distance:.2f} m away",
+        f"disparity: {low:.2f} to {high:.2f} px{sigma}; {found.distance:.2f} m from the camera",
         *_cost_lines(found),
     ]
 
@@ -147,7 +147,7 @@ def _cost_lines(found: Explanation) -> list[str]:
         return []
     lowest, next_lowest = found.costs[:, found.costs[0] < MAX_COST].astype(int)
     if not lowest.size:
-        return [f"search: no cost below {MAX_COST}: not searched at full size, or nothing alike was found"]
+        return [f"search: no cost below {MAX_COST}: not searched at full size, or no match was found"]
     cost, lead = (
         f"{values.min()} to {values.max()}, median {sorted(values)[len(values) // 2]}"
         for values in (lowest, next_lowest - lowest)
@@ -165,11 +165,11 @@ def _tilt_lines(found: Explanation) -> list[str]:
 
 def _against(name: str, found: Limit) -> str:
     value, limit, unit, made_of = found
-    more = f"; limit {_shown(limit, unit)} = {made_of}" if made_of else ""
+    more = f" ({made_of})" if made_of else ""
     if math.isnan(value):
         return "none (only hidden cells have one)" if name == "drop" else f"unknown (limit {_shown(limit, unit)})"
-    side = "exceeds" if value > limit else "within"
-    return f"{_shown(value, unit):>10} {side} {_shown(limit, unit)} by {_shown(abs(value - limit), unit)}{more}"
+    side = "above" if value > limit else "below"
+    return f"{_shown(value, unit):>10}, {_shown(abs(value - limit), unit)} {side} the limit {_shown(limit, unit)}{more}"
 
 
 def _change(stream: str, turn: Turn) -> str:
@@ -177,7 +177,7 @@ def _change(stream: str, turn: Turn) -> str:
     (needed, unit), (now, _) = _in_words(turn.needed, turn.unit), _in_words(turn.now, turn.unit)
     step = 10.0 ** (math.floor(math.log10(needed)) - 2)
     needed = (math.ceil if needed > now else math.floor)(needed / step) * step
-    return f"{stream}.{turn.parameter} = {_shown(needed, unit)} instead of {_shown(now, unit)}"
+    return f"{stream}.{turn.parameter} = {_shown(needed, unit)} (now {_shown(now, unit)})"
 
 
 def _shown(value: float, unit: str) -> str:

@@ -1,4 +1,4 @@
-"""Binds worker processes of this machine to the cores that they were promised, as a batch system does."""
+"""Binds worker processes of this machine to the cores assigned to them, as a batch system does."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ class Catalogue:
     Raises
     ------
     UsageError
-        If there is no catalogue, or the file is none.
+        If there is no catalogue, or the file is not one.
     UnwritableError
         If it cannot be written, as on a full disk.
     """
@@ -122,7 +122,7 @@ class Catalogue:
                 yield database
         except sqlite3.DatabaseError as error:
             if "not a database" in str(error):
-                raise UsageError(f"{self.path} is no catalogue; remove it or choose another folder") from error
+                raise UsageError(f"{self.path} is not a catalogue; remove it or choose another folder") from error
             if write:
                 raise unwritable(self.path, str(error)) from error
             raise

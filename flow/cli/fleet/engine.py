@@ -61,10 +61,10 @@ class Fleet:
                         self._watch(client, futures)
                         looked = time.monotonic()
                 except (OSError, TimeoutError, RuntimeError) as error:
-                    remedy = "the same command continues"
+                    remedy = "run the same command again to continue"
                     raise ClusterLostError(f"the cluster does not answer: {error}; {remedy}") from error
                 if client.status != "running":
-                    raise ClusterLostError("the scheduler is gone; the same command continues where this one ended")
+                    raise ClusterLostError("the scheduler is gone; run the same command again to continue")
                 if stop.finishing():
                     raise KeyboardInterrupt
                 if self.left:
@@ -103,14 +103,14 @@ class Fleet:
         if future.status == "finished":
             row = _ended(self.tasks[name], future.result())
         elif future.status != "error":  # the scheduler forgot it
-            raise ClusterLostError("the scheduler lost its tasks; the same command continues where this one ended")
+            raise ClusterLostError("the scheduler lost its tasks; run the same command again to continue")
         elif type(error := future.exception()).__name__ != "KilledWorker":
             row = {"state": "failed", "why": f"{type(error).__name__}: {error}"}
         elif name in self._again:
-            row = {"state": "killed", "why": "its workers died, by memory or a fault of the machine"}
+            row = {"state": "killed", "why": "its workers died: out of memory, or a machine fault"}
         else:
             self._again.add(name)
-            self.progress.say(f"{name}: its workers died; it is tried once more after the others")
+            self.progress.say(f"{name}: its workers died; it will run once more after the others")
             return self._submit(client, name, len(self.tasks))
         self._note(name, row)
         return None

@@ -35,7 +35,7 @@ def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, An
     found = (path for word in given for path in _logs(word, folder))
     logs = list(dict.fromkeys(path.resolve() if ".." in path.parts else path.absolute() for path in found))
     if not logs:
-        raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, patterns or a text file of them")
+        raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, glob patterns or a list of them")
     root = Path(os.path.commonpath([log.parent for log in logs]))
     known = {row["log"]: row["name"] for row in rows}
     jobs = [_job(log, root, known.get(str(log))) for log in logs]
@@ -48,7 +48,7 @@ def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, An
         if str(job.log) not in known and digests.get(job.name, job.digest) != job.digest:
             other = next(log for log, name in known.items() if name == job.name)
             raise UsageError(
-                f"{folder} has results of {other} by the name {job.name}; choose another --out, or rename {job.log}"
+                f"{folder} has results of {other} under the name {job.name}; choose another --out, or rename {job.log}"
             )
     return sorted(jobs, key=lambda job: (-job.size, job.name))
 

@@ -93,7 +93,7 @@ def watch(catalogue: Catalogue) -> int:
             progress.show({name: frames_so_far(_progress_file(catalogue, name)) or 0 for name in left})
             if left and held is False:
                 progress.say(
-                    f"no process runs this fleet, {counted(len(left), 'log')} left; the same command continues"
+                    f"no process runs this fleet, {counted(len(left), 'log')} left; run its command again to continue"
                 )
                 return INCOMPLETE
             time.sleep(WATCH_SECONDS if left else 0.0)

@@ -30,7 +30,7 @@ def progress_bar(out: Path, frames: int) -> Iterator[tuple[Callable[[int], None]
         try:
             yield progress, report
         except KeyboardInterrupt:
-            report(f"{out}: not complete; the same command continues the import")
+            report(f"{out}: not complete; run the same command again to continue the import")
             raise
 
 

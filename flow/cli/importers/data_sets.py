@@ -34,7 +34,7 @@ class DataSet:
     def add_arguments(self, sub: argparse.ArgumentParser) -> None:
         sub.add_argument("source", type=Path, metavar="SOURCE", help=self.source)
         sub.add_argument("out", type=Path, metavar="OUT.mcap", help="log to write")
-        sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"what the files do not say: {self.rig}")
+        sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"YAML file with missing data: {self.rig}")
         for name, option in self.options.items():
             sub.add_argument(f"--{name}", **option)
 
@@ -89,7 +89,7 @@ DATA_SETS = (
         "a raw drive of KITTI, or a sequence of its odometry benchmark",
         "folder of a drive, with the calibration in it or beside it; or of a sequence, with calib.txt",
         "for sequences height and pitch_down of the camera on base_link",
-        options={"color": {"action": "store_true", "help": "import the colour cameras, not the gray ones"}},
+        options={"color": {"action": "store_true", "help": "import the colour cameras instead of the gray ones"}},
     ),
     DataSet(
         "lusnar",

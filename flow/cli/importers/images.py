@@ -15,8 +15,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("source", type=Path, metavar="SOURCE", help="folder of left and right images")
     sub.add_argument("out", type=Path, metavar="OUT.mcap", help="log to write")
     camera = (
-        "of rectified pairs a YAML file: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height; "
-        "of others the files of OpenCV, Kalibr or ROS"
+        "for rectified pairs a YAML file: fx, cx, cy (px), baseline (m); optionally fy, cx_right, width, height; "
+        "for others the files of OpenCV, Kalibr or ROS"
     )
     sub.add_argument("--calibration", type=Path, nargs="+", required=True, metavar="FILE", help=camera)
     pitch = "angle of the camera below the horizon"

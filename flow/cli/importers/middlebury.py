@@ -9,7 +9,7 @@ from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE
 
-HELP = "a Middlebury scene with ground truth (camera pose unknown: assumes level, 1 m above ground)"
+HELP = "a Middlebury scene with ground truth (assumes a level camera 1 m above ground)"
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:

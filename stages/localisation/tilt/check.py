@@ -85,7 +85,7 @@ class CheckTilt(Stage):
     'The tilt was not checked: too few frames in which the rover moved (1; it takes 8 in a row).'
     """
 
-    window: int = parameter(50, "number of frames behind a judgement, at most", low=10)
+    window: int = parameter(50, "largest number of frames for a judgement", low=10)
 
     def start(self) -> TiltMemory:
         """The state of one run."""

@@ -168,8 +168,8 @@ def _passed(tried: _Hypotheses) -> Diagnosis:
     if sound.ground > MIN_GAIN:
         slope = GROUND_SIGMA * np.sqrt(sound.ground)
         sentence = (
-            f"Up is {degrees(slope)} off the normal of the ground ({n} frames). Check the inclinometer's axes and "
-            "source.camera_from_inclinometer. The rover has moved too little to identify the fault."
+            f"The tilt is {degrees(slope)} off the normal of the ground ({n} frames). Check the inclinometer's axes "
+            "and source.camera_from_inclinometer. The rover has moved too little to identify the fault."
         )
         return Diagnosis(OFF_GROUND, sentence, False)
     undecided = any(cause.score(variance) - sound.score(variance) < MIN_GAIN for cause in tried.axes)
@@ -185,7 +185,7 @@ def _passed(tried: _Hypotheses) -> Diagnosis:
 
 
 def _degrees_as_radians(evidence: Evidence) -> Diagnosis | None:
-    """Degrees taken for radians: up swings more than any camera fixed to it can.
+    """Degrees taken for radians: the tilt swings more than any camera fixed to the inclinometer can.
 
     The ground's normal bounds the swing by the camera's rotation, because up leans from it by at most `MAX_SLOPE`.
     """
@@ -205,7 +205,7 @@ def _degrees_as_radians(evidence: Evidence) -> Diagnosis | None:
         return None
     fault = "degrees are taken for radians"
     sentence = (
-        f"D{fault[1:]}: between frames up swings by {degrees(swing)}, but the camera's rotations allow "
+        f"D{fault[1:]}: between frames the tilt swings by {degrees(swing)}, but the camera's rotations allow "
         f"{degrees(possible)} ({len(near)} pairs of frames). Check the unit of source.pitch and source.roll (deg, not "
         "rad), or the inclinometer's driver."
     )

@@ -139,7 +139,7 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("toys.Keep}", "toys.Keep, only: [sum, twise]}", 8, ["there is no stream 'twise'", "did you mean 'twice'"]),
     ("toys.Keep}", "toys.Keep, only: [sum, level]}", 8,
      ["'level' does not run on the clock of the frames, 'both'; align"]),
-    ("  twice:", "  source:", 5, ["'source' is no name of a stream"]),
+    ("  twice:", "  source:", 5, ["'source' cannot name a stream"]),
     ("sinks:", "sinkz:", 7, ["no 'sinkz'", "did you mean 'sinks'"]),
     ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
     ("  sum: ", "  both:", 6, ["'both' is here twice"]),
@@ -149,11 +149,11 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("2.5}", f"{10**400}}}", 1, ["gain: int too large"]),
     ("2.5}", f"1{'0' * 5000}}}", 1, ["looks like a YAML int but is none; quote it"]),
     ("25 cm", "2001-99-99", 5, ["'2001-99-99' looks like a YAML timestamp but is none; quote it"]),
-    ("  twice:", "  my-twice:", 5, ["'my-twice' is no name of a stream"]),
-    ("  twice:", "  2nd:", 5, ["'2nd' is no name of a stream"]),
-    ("  twice:", "  yes:", 5, ["'yes' is no name", "quoted"]),
-    ("{use: tests.flow.toys.Scale", "{<<: {a: 1}, use: tests.flow.toys.Scale", 5, ["'<<' is no name"]),
-    ("  twice:", "  ? [1]\n  :", 5, ["a list or a mapping is no name"]),
+    ("  twice:", "  my-twice:", 5, ["'my-twice' cannot name a stream"]),
+    ("  twice:", "  2nd:", 5, ["'2nd' cannot name a stream"]),
+    ("  twice:", "  yes:", 5, ["'yes' is not a name", "quoted"]),
+    ("{use: tests.flow.toys.Scale", "{<<: {a: 1}, use: tests.flow.toys.Scale", 5, ["'<<' is not a name"]),
+    ("  twice:", "  ? [1]\n  :", 5, ["a list or a mapping is not a name"]),
     ("a: twice", "a: [twice]", 6, ["'a' must be the name of a stream, not ['twice']"]),
     ("tests.flow.toys.Add", "[tests.flow.toys.Add]", 6, ["'use: ['tests.flow.toys.Add']' must be a module and"]),
     ("tests.flow.toys.Add", "tests..toys.Add", 6, ["'use: tests..toys.Add' must be a module and a class"]),
@@ -194,7 +194,7 @@ def test_a_setting_is_filled_in_wherever_it_is_named(tmp_path):
 @pytest.mark.parametrize(("text", "overrides", "message"), [
     (SETTINGS.replace("$stretch", "$strech"), [], r"toy.yaml:6: there is no setting 'strech'; did you mean 'stretch'"),
     (GOOD.replace("25 cm", "$stretch"), [], r"toy.yaml:5: there is no setting 'stretch'"),
-    (SETTINGS.replace("$stretch", "2 m"), [], r"toy.yaml:1: the setting 'stretch' is used nowhere"),
+    (SETTINGS.replace("$stretch", "2 m"), [], r"toy.yaml:1: the setting 'stretch' is not used"),
     (SETTINGS.replace("25 cm", "25 s"), [], r"toy.yaml:1: .*'25 s' is a time"),
     (SETTINGS.replace("25 cm", "25"), [], r"toy.yaml:1: .*Scale.factor: 25 needs a unit; write 25 cm or 25 m"),
     (SETTINGS, ["stretch=20"], r"--set stretch=20: .*Scale.factor: 20 needs a unit; write 20 cm or 20 m"),
@@ -260,11 +260,11 @@ def own(field="int", takes="couple: Couple", returns="Couple"):
      "5: Own.__call__ does not say which one type it returns"),
     (IDLE, ADD, "Own", "6: 'sum' has no input"),
     (ODD, ADD, "Own, a: twice, b: height", "6: KeyError: 'nix' (MODULE.py, line 8; --debug"),
-    (PLAIN, SCALE, "Own", "5: MODULE.Own is no dataclass; decorate"),
+    (PLAIN, SCALE, "Own", "5: MODULE.Own is not a dataclass; decorate"),
     (IMPORTS + "class Own(Scale):\n    more: int = field(default=0)\n", SCALE, "Own, couple: both",
-     "5: MODULE.Own has parameters, but is no dataclass; decorate it with @dataclass(frozen=True)"),
+     "5: MODULE.Own has parameters, but is not a dataclass; decorate it with @dataclass(frozen=True)"),
     (PLAIN + "def function(): ...\n", SCALE, "function",
-     "5: MODULE.function is no dataclass; a stage is a class with __call__"),
+     "5: MODULE.function is not a dataclass; a stage is a class with __call__"),
     *((own(field=field), SCALE, f"Own, couple: both, a: {value}", f"5: MODULE.Own.a: {why}") for field, value, why in (
         ("list[int]", "[1, 'x']", "'x' is not a number"), ("Sequence[int]", "5", "expected a list, not 5"),
         ("tuple[int, str]", "[1, 2]", "expected a text, not 2"), ("dict[str, int]", "{n: x}", "'x' is not a number"),
@@ -313,7 +313,7 @@ def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, t
 
 def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
     (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
-    with pytest.raises(UsageError, match=r"t.mcap is no text; give accurate, fast, paper, rover or a YAML file"):
+    with pytest.raises(UsageError, match=r"t.mcap is not text; give accurate, fast, paper, rover or a YAML file"):
         load(str(tmp_path / "t.mcap"))
 
 

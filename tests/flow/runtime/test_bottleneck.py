@@ -23,10 +23,10 @@ def test_the_slowest_stage_and_sink_are_named():
 @pytest.mark.parametrize(("workers", "cores", "serial", "said"), [
     (2, 8, {}, "up to 50% more frames/s"),
     (3, 8, {}, "up to 33% more frames/s"),
-    (4, 8, {}, "would bring nothing, because RerunSink takes one frame at a time"),
-    (2, 8, {"reading the log": 6.0}, "would bring nothing, because reading the log takes one frame at a time"),
+    (4, 8, {}, "would not help, because RerunSink takes one frame at a time"),
+    (2, 8, {"reading the log": 6.0}, "would not help, because reading the log takes one frame at a time"),
     (2, 8, {"fuse": 5.0}, "up to 20% more frames/s"),
-    (2, 2, {}, "would bring nothing, because each of the 2 cores has one"),
+    (2, 2, {}, "would not help, because each of the 2 cores has one"),
 ])  # fmt: skip
 def test_another_worker_brings_what_serial_work_and_cores_allow(workers, cores, serial, said):
     serial = serial and {"recordings.RerunSink": 3.0, **serial}

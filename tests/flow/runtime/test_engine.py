@@ -184,7 +184,7 @@ def test_an_abandoned_frame_reports_only_its_losses_so_far(tmp_path, monkeypatch
     for thread in threading.enumerate():
         if thread.name.startswith("worker-"):
             thread.join(5)
-    abandoned = Loss("frame", 0, "engine", LossReason.ABANDONED, "the run ended before the frame was through")
+    abandoned = Loss("frame", 0, "engine", LossReason.ABANDONED, "the run ended before the frame was finished")
     assert engine.late_entries == [lost, abandoned]
     assert set(ledger.entries) == {lost, abandoned}
     assert (completeness, engine.through) == ([], 0)

@@ -122,10 +122,10 @@ def test_the_advice_for_a_stopped_recorder_adds_its_messages(database, tmp_path,
             "DROP TABLE topics",
             "ALTER TABLE other RENAME TO topics",
         ],
-        "is no rosbag2 recording or is damaged (int() argument must be",
+        "is not a rosbag2 recording or is damaged (int() argument must be",
     ),
     (["DELETE FROM messages"], "contains no messages; record it again"),
-    (["ALTER TABLE topics RENAME COLUMN type TO kind"], "is no rosbag2 recording or is damaged (no such column"),
+    (["ALTER TABLE topics RENAME COLUMN type TO kind"], "is not a rosbag2 recording or is damaged (no such column"),
 ])  # fmt: skip
 def test_a_database_without_messages_is_refused(database, statements, sentence):
     edit(database, *statements)
@@ -175,7 +175,7 @@ def test_a_bag_of_a_stopped_recorder_is_read_without_its_index(sample, tmp_path,
     kept, lost = read(path)
     assert kept == sound[0]
     where = f"at byte {index} of {index + 3000} (no whole record is there)"
-    assert lost == [f"the bag is cut or damaged {where}; before that it contains {len(kept)} messages"]
+    assert lost == [f"the bag is truncated or damaged {where}; intact before it: {len(kept)} messages"]
 
 
 def test_the_last_chunk_of_a_stopped_recorder_has_no_stated_size(sample, tmp_path):
@@ -206,7 +206,7 @@ def test_messages_of_an_unknown_connection_of_a_bag_are_reported(sample, tmp_pat
 def test_a_bag_without_messages_is_refused(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
     content = path.read_bytes()
-    why = r"log\.bag cannot be read \(Bag is not indexed\); record it again, as it shows no messages"
+    why = r"log\.bag cannot be read \(Bag is not indexed\); record it again, as no message is found"
     for size in (4109, 4200):  # after the header, and in the first record of the first chunk
         path.write_bytes(content[:size])
         with pytest.raises(LogError, match=why):

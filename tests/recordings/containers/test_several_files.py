@@ -83,7 +83,7 @@ def test_damage_names_its_file(sample, tmp_path):
     folder = write_rosbag2(rows_of(sample), tmp_path / "bag", parts=3)
     (folder / "bag_2.mcap").write_bytes((folder / "bag_2.mcap").read_bytes()[:5000])
     (damage,) = inventory_of(folder)["damage"]
-    assert damage.startswith("bag_2.mcap: the log is cut or damaged at byte ")
+    assert damage.startswith("bag_2.mcap: the log is truncated or damaged at byte ")
 
 
 @pytest.mark.parametrize("keep", ["metadata.yaml", "the numbers alone"])

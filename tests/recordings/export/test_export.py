@@ -257,14 +257,14 @@ def test_the_readable_part_of_a_cut_log_is_exported(tmp_path):
             writer.metadata("between", {})  # ends the chunk
     content = path.read_bytes()
     path.write_bytes(content[: content.index(b"between") + 60])
-    with pytest.raises(LogError, match="cut or damaged"):
+    with pytest.raises(LogError, match="truncated or damaged"):
         export(path, tmp_path / "none")
     lost = Counter[str]()
     export(path, tmp_path / "out", lost=lost)
-    assert [why.partition(" at byte")[0] for why in lost] == ["the log is cut or damaged"]
+    assert [why.partition(" at byte")[0] for why in lost] == ["the log is truncated or damaged"]
     with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
         assert (file.width, file.height) == (40, 30)
-    with pytest.raises(LogError, match=r"cut or damaged .*; the rest cannot be exported"):
+    with pytest.raises(LogError, match=r"truncated or damaged .*; the rest cannot be exported"):
         export(path, tmp_path / "nothing", frames=True, lost=Counter())
 
 
@@ -348,7 +348,7 @@ def test_maps_are_exported_by_the_names_of_their_streams(tmp_path):
         files = export(path, tmp_path / folder.partition("/")[0], maps=[name])
         assert files == [tmp_path / folder / f"navigation_map.{suffix}" for suffix in ("pgm", "yaml")]
     assert files[0].read_bytes() == (tmp_path / "both" / "navigation_map.pgm").read_bytes()
-    meant = r"no map 'sparse_map', only frame_cells, sparse/cells, sparse/map; did you mean 'sparse/map'\?"
+    meant = r"no map 'sparse_map'; its maps: frame_cells, sparse/cells, sparse/map; did you mean 'sparse/map'\?"
     with pytest.raises(LogError, match=meant):
         export(path, tmp_path / "none", maps=["sparse_map"])
     with pytest.raises(LogError, match="sparse/cells and frame_cells are both navigation maps"):

@@ -57,7 +57,7 @@ def test_places_in_utm_are_those_of_proj(zone, latitude, longitude):
 
 @pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32661", "EPSG:32600", "33N", ""])
 def test_another_crs_is_refused(crs):
-    with pytest.raises(LogError, match="no zone of UTM"):
+    with pytest.raises(LogError, match="not a UTM zone"):
         zone_of(crs, 0, 0)
 
 
@@ -106,7 +106,11 @@ def test_fixes_that_say_too_little_are_refused(result, traverse, tmp_path, refus
     stamps, places = driven(result)
     noisy = write_fixes(tmp_path / "noisy.mcap", stamps, on_grid(places), 3.0)
     few = write_fixes(tmp_path / "few.mcap", stamps[:2], on_grid(places[:2]))
-    for log, sentence in ((noisy, "leave the heading of 'odom' open"), (few, "only 2 fixes"), (traverse, "no fixes")):
+    for log, sentence in (
+        (noisy, "do not determine the heading of 'odom'"),
+        (few, "only 2 fixes"),
+        (traverse, "no fixes"),
+    ):
         assert sentence in refused("export", result, tmp_path / "maps", "--crs", "utm", "--fixes", log)
         assert not (tmp_path / "maps").exists()
     assert roverflow("export", result, tmp_path / "maps", "--frames", "--crs", "utm") == 2

@@ -65,7 +65,7 @@ def test_poses_in_another_frame_of_reference_are_no_motion(tmp_path):
         assert trajectory.path_length == pytest.approx(0.2)
     write_report(tmp_path / "out.html", [path])
     page = (tmp_path / "out.html").read_text()
-    assert [page.count(f"way in {frame_id}, ") for frame_id in frames] == [1, 1]
+    assert [page.count(f"trajectory in {frame_id}, ") for frame_id in frames] == [1, 1]
 
 
 def heading(trajectory):

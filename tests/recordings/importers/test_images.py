@@ -237,7 +237,7 @@ def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, said)
     save(left[2], picture(0)[:8])
     given = "--calibration", tmp_path / "camera.yaml", "--pitch-down", 15, "--height", 0.9
     text = said(0, "import", "images", tmp_path / "pairs", tmp_path / "out.mcap", *given).out
-    assert f"2 pairs left out, first: {right[1]} is cut after" in text
+    assert f"2 pairs left out, first: {right[1]} is truncated after" in text
     assert "2 stereo frames" in text
     read = [item.stamp for _, stream, item in events(tmp_path / "out.mcap") if stream == "left"]
     assert np.diff(read).tolist() == [3_000_000_000]
@@ -272,7 +272,7 @@ def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
     ("name,roll\n0-left,3\n", "has the columns name, roll; its first line must name"),
     ("name,pitch_down\n1-left,3\n", "has no row for 0-left.png"),
     ("name,pitch_down,roll\n0-left,3\n", "line 2 has 2 columns, but the first line names 3"),
-    ("name,pitch_down\n0-left,down\n", "line 2 contains what is no number"),
+    ("name,pitch_down\n0-left,down\n", "line 2 contains what is not a number"),
     ("name,pitch_down\n0-left,200\n", "line 2: pitch_down must be at most 180 deg"),
 ], ids=range(6))  # fmt: skip
 def test_attitudes_that_are_none_are_refused(tmp_path, text, words):

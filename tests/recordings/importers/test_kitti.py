@@ -150,10 +150,10 @@ def test_an_odometry_sequence_is_the_simulators_log(tmp_path, said, refused, key
     simulation = gray(replace(EXACT, slope=0.0))  # the rover stands level, as the rig file says
     (folder, rig), own = write_sequence(simulation, tmp_path, keys), own_log(simulation, tmp_path / "own.mcap")
     log = tmp_path / "log.mcap"
-    assert "turned by the true poses in 05.txt" in said(0, "import", "kitti", folder, log, "--rig", rig).out
+    assert "rotated by the true poses in 05.txt" in said(0, "import", "kitti", folder, log, "--rig", rig).out
     assert_same(log, own, stamps=False, tolerance=1e-7)
     (tmp_path / "poses" / "05.txt").unlink()
-    assert "the car is taken as level" in said(0, "import", "kitti", folder, log, "--rig", rig).out
+    assert "the car is assumed level" in said(0, "import", "kitti", folder, log, "--rig", rig).out
     assert_same(log, own, stamps=False, tolerance=1e-7)
     text = refused("import", "kitti", folder, log)
     assert (

@@ -132,7 +132,7 @@ def calibrate(**changes: object):
     (calibrate(width=48), r"im0\.png is 96x64, but the calibration is for 48x64"),
     (spoil("disp0GT.pfm", b"P6\n3 2\n255\n" + bytes(18)), r"disp0GT\.pfm is not a PFM file of one channel"),
     (spoil("disp0GT.pfm", b""), r"disp0GT\.pfm is not a PFM file"),
-    (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels, but 3x2 pixels need 24"),
+    (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(23)), r"has 23 bytes of pixels, not 24 for 3x2"),
     (spoil("disp0GT.pfm", b"Pf\n3 2\n1e\n" + bytes(24)), r"its scale 1e is not a number"),
     (spoil("disp0GT.pfm", b"Pf\n3 2\n-1\n" + bytes(24)), r"disp0GT\.pfm is 3x2, but the images are 96x64"),
     (spoil("mask0nocc.png", b""), r"mask0nocc\.png is not a readable image"),

@@ -97,7 +97,7 @@ def test_the_import_of_a_process_that_was_ended_is_continued(source, tmp_path, n
     child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert child.returncode == (-number if number == signal.SIGKILL else 130), child.stderr
     if number != signal.SIGKILL:
-        assert f"{out}: not complete; the same command continues the import" in child.stdout
+        assert f"{out}: not complete; run the same command again to continue the import" in child.stdout
     (left,) = tmp_path.iterdir()
     assert left.suffix == ".partial"
     assert f"{out}: continues the interrupted import after 3 frames" in said(0, *importing(source, out)).out

@@ -138,7 +138,7 @@ def test_a_section_of_devon_is_the_simulators_log(tmp_path, said, refused, sampl
     folder, own = write_devon(EXACT, tmp_path, sampled), own_log(EXACT, tmp_path / "own.mcap")
     log = tmp_path / "log.mcap"
     text = said(0, "import", "devon", folder, log, "--rig", tmp_path / "rig.yaml").out
-    assert "1 pair left out, as image-times.txt has no time of its number" in text
+    assert "1 pair left out, as image-times.txt has no time for its number" in text
     assert_same(log, own)
     (tmp_path / "rig.yaml").write_text((tmp_path / "rig.yaml").read_text().replace("pitch_sign: -1\n", ""))
     text = refused("import", "devon", folder, log, "--rig", tmp_path / "rig.yaml")

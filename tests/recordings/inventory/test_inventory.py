@@ -116,7 +116,7 @@ def test_images_of_a_second_camera_on_a_topic_are_not_usable(tmp_path, monkeypat
     assert "doubtful" not in format_description(described)
     (damage,) = described["damage"]
     why = "the calibration differs from the log's first one, so the image cannot be used"
-    assert damage.startswith(f"2 similar, first: {LEFT} at {START + PERIOD} ns: {why}; cut the log in two where it ")
+    assert damage.startswith(f"2 similar, first: {LEFT} at {START + PERIOD} ns: {why}; split the log where it ")
 
 
 def test_without_cameras_no_pairs_are_reported(tmp_path):
@@ -149,7 +149,7 @@ def test_streams_without_stamps_are_noted(tmp_path):
 
 
 def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
-    doubt = "doubtful: from stamp to log, tilts take 2.0 s longer than images; if no clock is wrong"
+    doubt = "doubtful: tilts are logged 2.0 s later after their stamps than images; if no clock is wrong"
     earlier = changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 2})
     assert doubt in text_of(tmp_path, earlier)
     assert doubt not in text_of(tmp_path)
@@ -232,8 +232,8 @@ def test_damage_is_reported(tmp_path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     description = inventory_of(path)
     assert not description["indexed"]
-    assert "the log is cut or damaged at byte" in description["damage"][0]
-    assert "damaged: the log is cut" in format_description(description)
+    assert "the log is truncated or damaged at byte" in description["damage"][0]
+    assert "damaged: the log is truncated" in format_description(description)
 
 
 def test_without_a_tilt_no_frame_has_one(tmp_path):

@@ -104,7 +104,7 @@ def test_messages_before_the_cut_in_a_chunk_are_rescued(sample, whole, tmp_path)
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(full.read_bytes()[: int(full.stat().st_size * 0.6)])
     events = items_of(cut)
-    assert "the log is cut or damaged at byte" in str(events[-1][2])
+    assert "the log is truncated or damaged at byte" in str(events[-1][2])
     assert isinstance(events[-1][2], LogError)
     assert sum(stream == "left" for _, stream, _ in events[:-1]) == 3
     assert essences(events[:-1]) == essences(whole[: len(events) - 1])
@@ -169,7 +169,7 @@ def test_a_broken_length_does_not_fill_the_memory(tmp_path):
         file.write(MAGIC + record(1, b"\0" * 8) + struct.pack("<BQ", 6, 1 << 40))
         file.truncate(1 << 30)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(LogError, match="contains no messages that can be read: the log is cut or damaged at byte 25"):
+    with pytest.raises(LogError, match="no messages that can be read: the log is truncated or damaged at byte 25"):
         McapFile(path)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000  # kB
 
@@ -270,8 +270,8 @@ def test_an_index_entry_beyond_the_end_loses_only_its_chunk(sample, tmp_path):
     (b"", "is empty"),
     (b"hello, I am a text file\n", "is not an MCAP log"),
     (b"#ROSBAG V2.0\n....", "cannot be read"),
-    (b"SQLite format 3\0....", "is no rosbag2 recording or is damaged"),
-    (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is cut"),
+    (b"SQLite format 3\0....", "is not a rosbag2 recording or is damaged"),
+    (b"\x89MCAP0\r\n", "contains no messages that can be read: the log is truncated"),
 ])  # fmt: skip
 def test_a_file_of_another_format_is_refused_by_its_name(tmp_path, content, sentence):
     path = tmp_path / "log.mcap"

@@ -40,8 +40,8 @@ def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(sample, who
     images = [(time, sentence) for time, sentence in lost if sentence.startswith(f"{LEFT}: ")]
     assert [time for time, _ in images] == [START + number * PERIOD - BACK + 1000 for number in range(FIRST, FRAMES)]
     sentence = (
-        "the log's clock and the header stamps were set back by at least 0.13 s, and it is not yet 1 s beyond its old "
-        "time: the times repeat"
+        "the recorder's clock and the header stamps were set back by at least 0.13 s: times repeat, so messages are "
+        "lost until the clock is 1 s past its old time"
     )
     assert {errors for _, errors in images} == {f"{LEFT}: {sentence}"}
     with McapSource().open(path) as log:
@@ -116,7 +116,9 @@ def test_images_and_tilts_across_a_set_back_clock_are_not_joined(sample, tmp_pat
     path = rewrite(sample, tmp_path / "log.mcap", order=rare_images, **options)
     left = [item for _, stream, item in items_of(path) if stream == "left"]
     assert [item.stamp for item in left if not isinstance(item, Exception)] == [START]
-    assert len([item for item in left if str(item).startswith(f"{LEFT}: the log's clock and the header stamps")]) == 2
+    assert (
+        len([item for item in left if str(item).startswith(f"{LEFT}: the recorder's clock and the header stamps")]) == 2
+    )
 
 
 @EVERY_LAYOUT

@@ -100,7 +100,7 @@ def test_compressed_images_are_decoded_and_cut_ones_refused():
     jpeg = cv2.imencode(".jpg", flat[:, :, ::-1])[1].tobytes()
     np.testing.assert_allclose(pixels_of(compressed(jpeg, "jpeg")).astype(int), flat, atol=3)
     for data, kind in ((png, "png"), (jpeg, "jpeg")):
-        with pytest.raises(LogError, match="the compressed image is cut"):
+        with pytest.raises(LogError, match="the compressed image is truncated"):
             pixels_of(compressed(data[:-20], kind))
     with pytest.raises(LogError, match="cannot be decoded"):
         pixels_of(compressed(b"nonsense", "jpeg"))

@@ -64,7 +64,7 @@ def test_a_log_has_a_raw_imu_in_place_of_the_inclinometer(tmp_path):
     with McapSource().open(path) as log:
         assert log.missing == {}
         assert log.topics["inclinometer"] == "/imu/data_raw"
-        assert "up is estimated from the accelerations and rates on /imu/data_raw" in log.notes()["inclinometer"]
+        assert "the tilt is estimated from the accelerations and rates on /imu/data_raw" in log.notes()["inclinometer"]
 
 
 @pytest.mark.slow

@@ -133,7 +133,7 @@ def test_the_desks_of_a_recording_are_files_for_the_viewer(rrd, tmp_path, capsys
     assert roverflow("desk", tmp_path / f"{rrd.stem}-tilt.rbl", "--desk", "tilt", "--out", tmp_path) == 2
     (tmp_path / f"{rrd.stem}-tilt.rbl").write_text("mine")
     assert roverflow("desk", rrd, "--out", tmp_path, "--desk", "tilt") == 2
-    assert "exists and is no desk of roverflow" in capsys.readouterr().err
+    assert "exists and is not a roverflow desk" in capsys.readouterr().err
 
 
 def test_a_desk_is_not_begun_on_a_full_disk(rrd, tmp_path, said, monkeypatch):

@@ -240,7 +240,7 @@ def test_an_infinite_translation_is_reported_and_left_out(tmp_path):
         assert "no static transform joins the camera" in log.missing["mount"]
         ((_, _, problem),) = losses_in(log.events())
     what = "the translation of the transform 'base_link' <- 'left_optical'"
-    assert problem == f"/tf_static: {what} is [nan, 0.1, 0.9], which is no place"
+    assert problem == f"/tf_static: {what} is [nan, 0.1, 0.9], which is not a position"
 
 
 def test_a_long_chain_of_transforms_is_followed():

@@ -40,7 +40,7 @@ def test_an_image_under_another_calibration_is_lost(tmp_path, lag):
     assert [(time, stream) for time, stream, _ in lost] == [
         (START + number * PERIOD + IMAGE_LAG, "left") for number in (2, 3)
     ]
-    assert all(f"cut the log in two where it changes ({START + 2 * PERIOD} ns)" in sentence for _, _, sentence in lost)
+    assert all(f"split the log where it changes ({START + 2 * PERIOD} ns)" in sentence for _, _, sentence in lost)
     left = [item.stamp for _, stream, item in events if stream == "left" and not isinstance(item, Exception)]
     assert left == [START + number * PERIOD for number in (0, 1, 4)]
     assert sum(stream == "right" for _, stream, _ in events) == FRAMES
@@ -118,7 +118,7 @@ def test_undecodable_messages_of_a_used_topic_are_counted(sample, tmp_path, topi
         ((_, lossy, why),) = losses_in(log.events())
     assert lossy == stream
     assert f"{topic}: 2 messages of its channel" in why
-    assert "in 'cbor', which cannot be read" in why
+    assert "in 'cbor', which is not supported" in why
     described = inventory_of(path)
     counts = [(item["encoding"], item["messages"]) for item in described["topics"] if item["topic"] == topic]
     assert sorted(counts) == [("cbor", 2), ("cdr", 3)]

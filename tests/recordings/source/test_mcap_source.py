@@ -145,7 +145,7 @@ def test_a_bad_message_is_lost_alone(tmp_path):
     )  # fmt: skip
     events = items_of(write_sample(tmp_path / "log.mcap", *edits))
     problems = {stream: str(item) for _, stream, item in events if isinstance(item, Exception)}
-    assert f"the image is cut: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in problems["left"]
+    assert f"the image is truncated: it has {WIDTH * HEIGHT * 3 - 5} of {WIDTH * HEIGHT * 3} bytes" in problems["left"]
     assert "image encoding 'packed10' is not supported" in problems["right"]
     assert "the quaternion of the inclinometer is not a rotation" in problems["inclinometer"]
     assert "its stamp is damaged (4294967295 ns beyond the second)" in problems["odometry"]
@@ -168,7 +168,7 @@ def test_a_camera_with_only_broken_images_is_missing(tmp_path, whole, monkeypatc
     monkeypatch.setattr("recordings.source.topics._MAX_SAMPLES", 1)
     problems = missing_in(write_sample(tmp_path / "log.mcap", edit))
     assert list(problems) == (["right"] if whole is None else [])
-    assert all(why.startswith(f"{RIGHT}: the image is cut: ") for why in problems.values())
+    assert all(why.startswith(f"{RIGHT}: the image is truncated: ") for why in problems.values())
 
 
 DEEP = {"encoding": "mono16", "step": 2 * WIDTH, "data": lambda data: data[: 2 * WIDTH * HEIGHT]}

@@ -179,13 +179,13 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
 
 
 @pytest.mark.parametrize(("content", "sentence"), [
-    ("", "contains no names with values"),
+    ("", "is not a mapping; write lines of NAME: VALUE"),
     ("{}", "has no joints; write one entry each"),
     ("pan: !!timestamp x", "cannot be read as YAML"),
     ("pan: " + "[" * 2000, "cannot be read as YAML"),
     ("pan: " + "9" * 5000, "cannot be read as YAML"),
     (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "which are not three numbers"),
-    ("pan: [1, 2]", "joint 'pan' is no mapping"),
+    ("pan: [1, 2]", "joint 'pan' is not a mapping"),
     ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),
     ("pan: {parent: a}", "joint 'pan' needs the name of its frame 'child'"),
     ("pan: {parent: a, child: b, xyz: [1, 2, x]}", "joint 'pan' has xyz: [1, 2, 'x'], which are not three numbers"),
@@ -223,5 +223,5 @@ def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
     file = tmp_path / "mast.yaml"
     file.write_text("turret: {parent: base_link, child: mast, axis: [0, 0, 1]}")
     log, none = written(tmp_path / "log.mcap", angles), written(tmp_path / "none.mcap", lambda stamp: None)
-    assert refused_in(log, joints=str(file))["joints"].endswith("no angles of; it has those of wheel, pan")
+    assert refused_in(log, joints=str(file))["joints"].endswith("mast.yaml; it has those of wheel, pan")
     assert refused_in(none, joints=str(file))["joints"].endswith("it has no sensor_msgs/JointState")

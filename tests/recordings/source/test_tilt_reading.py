@@ -88,11 +88,11 @@ def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why
     assert (len(tilts), lost) == (len(driven.stamps), [])
     assert np.sqrt(np.mean(driven.errors(tilts) ** 2)) < 0.3
     assert all(0 < tilt.sigma < np.radians(1) and tilt.frame_id == "imu_link" for tilt in tilts)
-    assert note.startswith(f"up is estimated from the accelerations and rates on {IMU}, because its orientation is not")
+    assert note.startswith(f"the tilt is estimated from the accelerations and rates on {IMU}, because its orientation")
     assert why in note
     assert "at rest for 4 of 12 s; gravity is 9.79 m/s2, as on Earth" in note
     shown = format_description(inventory_of(path, max_gap=10**8))
-    assert f"note: inclinometer: up is estimated from the accelerations and rates on {IMU}" in shown
+    assert f"note: inclinometer: the tilt is estimated from the accelerations and rates on {IMU}" in shown
 
 
 def test_a_part_of_a_log_has_tilts_as_good_as_the_whole(tmp_path):
@@ -242,7 +242,7 @@ def test_an_inclinometer_may_log_three_accelerations(tmp_path, field, sign):
     assert "whose numbers have no defined meaning; set 'pitch', 'roll'" in missing(path)
     tilts, _, note = read(path, McapSource(accelerations=AccelerationField(field, sign)))
     assert driven.errors(tilts[:400]).max() < 0.5
-    assert "the direction of each acceleration on /inclinometer, right only at rest" in note
+    assert "the direction of the acceleration on /inclinometer, right only at rest" in note
     assert "has no field 'angles.x'" in missing(path, accelerations=AccelerationField("angles"))
 
 
@@ -269,7 +269,7 @@ def test_poses_in_an_upright_frame_are_tilts_where_a_setting_says_so(tmp_path):
         tilts, lost, note = read(path, source)
         assert (len(tilts), lost) == (len(driven.stamps), [])
         np.testing.assert_allclose(tilts[0].up, turn.inv().apply([0, 0, 1]), atol=1e-12)
-        assert "in 'odom' with z up" in note
+        assert "whose frame 'odom' has z up" in note
     with McapSource(upright_frame="odom").open(path) as log:  # these poses place the rover too
         assert sum(isinstance(item, Pose) for _, _, item in log.events()) == len(driven.stamps)
     _, lost, _ = read(path, McapSource(upright_frame="map"))

@@ -47,7 +47,7 @@ def test_an_overhang_has_voxels_and_colours_of_its_own():
 
 
 def test_a_map_of_too_many_voxels_is_refused():
-    limit = r"VoxelGrid\.max_range = 100 m makes a map 40000 cells of 0\.005 m wide, and 4000"
+    limit = r"VoxelGrid\.max_range = 100 m makes a map 40000 cells of 0\.005 m wide; the limit is 4000"
     with pytest.raises(ValueError, match=limit):
         VoxelGrid(resolution=0.005, max_range=100.0)
     corners = cloud_of([[9.902, 0, 0], [0, 9.902, 0], [0, -9.902, 0]])

@@ -208,7 +208,7 @@ def test_a_map_of_a_log_is_not_continued_from_another_place():
     assert fuse(cloud, pose, MOUNT, state=fuse.resumed([terrain])).stamp == START
     for shift in ([0.06, 0, 0], [0, -0.06, 0]):
         state = fuse.resumed([terrain])
-        with pytest.raises(StageError, match="its pose is more than a cell off its place"):
+        with pytest.raises(StageError, match="its pose is more than a cell off that map"):
             fuse(cloud, replace(pose, position=pose.position + shift), MOUNT, state=state)
 
 

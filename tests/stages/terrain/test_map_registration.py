@@ -117,7 +117,7 @@ def raised(pose, up):
     ("change", "message"),
     [
         (lambda cloud, pose: (replace(cloud, frame_id="camera", sensor=None), pose), "put stages.Level before it"),
-        (lambda cloud, pose: (replace(cloud, sensor=None), pose), "lacks its camera's place"),
+        (lambda cloud, pose: (replace(cloud, sensor=None), pose), "lacks its camera's pose"),
         (lambda cloud, pose: (cloud, replace(pose, child_frame_id="mast")), "the pose is of 'mast', and no transform"),
         (lambda cloud, pose: (cloud, leant(pose, 180)), "180 degrees off the vertical .* whose z points up"),
         (lambda cloud, pose: (replace(cloud, stamp=START), pose), "is not later than the last one"),
