@@ -280,16 +280,11 @@ def test_smoothing_takes_all_samples_about_the_stamp_and_waits_for_them():
     assert found == [(100, pytest.approx(9.967, abs=1e-3)), (205, pytest.approx(20.5))]
 
 
-def test_smoothing_reaches_equally_far_back_and_ahead():
-    ramp = [(10 * count, float(count)) for count in range(30)]
-    found = values(smoothing(ramp, [100, 110, 120, 130], 50))
-    assert found == [(stamp, pytest.approx(stamp / 10)) for stamp in (100, 110, 120, 130)]
-
-
-def test_smoothing_keeps_the_samples_that_the_next_frame_needs():
-    bent = [(10 * count, float(count**2)) for count in range(30)]
-    found = values(smoothing(bent, [100, 110, 120, 130], 50))  # of five samples to either side the mean is 10 more
-    assert found == [(stamp, pytest.approx((stamp / 10) ** 2 + 10)) for stamp in (100, 110, 120, 130)]
+@pytest.mark.parametrize(("power", "more"), [(1, 0), (2, 10)])  # of five samples to either side, the mean is 10 more
+def test_smoothing_reaches_equally_far_back_and_ahead_for_each_frame(power, more):
+    curve = [(10 * count, float(count**power)) for count in range(30)]
+    found = values(smoothing(curve, [100, 110, 120, 130], 50))
+    assert found == [(stamp, pytest.approx((stamp / 10) ** power + more)) for stamp in (100, 110, 120, 130)]
 
 
 def test_smoothing_does_not_lag_at_the_ends_of_a_stream():

@@ -173,9 +173,13 @@ def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, words):
         assert word in message
 
 
-@pytest.mark.parametrize("text", ["", "just words", "[1, 2]", "streams: {}", "source: 3\nstreams: 4\nsinks: 5"])
-def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text):
-    with pytest.raises(PipelineError, match=r"toy\.yaml:\d: "):
+@pytest.mark.parametrize(("text", "why"), [
+    *((text, r"\d: ") for text in ("just words", "[1, 2]", "streams: {}", "source: 3\nstreams: 4\nsinks: 5")),
+    *((text, "1: .*; begin with a copy of .*/flow/pipelines/rover.yaml") for text in ("", "source: {use: a.B}")),
+    ("a: &a [*a]\n", r"\d: .*anchor"),
+])  # fmt: skip
+def test_a_file_that_is_no_pipeline_is_refused(tmp_path, text, why):
+    with pytest.raises(PipelineError, match=rf"toy\.yaml:{why}"):
         loaded(tmp_path, text)
 
 
@@ -296,11 +300,6 @@ def test_stages_may_be_in_the_folder_of_the_pipeline_file(tmp_path):
     assert {node.name: node.use for node in loaded(tmp_path, text).nodes}["twice"] == "beside.Near"
 
 
-def test_a_recursive_anchor_is_refused(tmp_path):
-    with pytest.raises(PipelineError, match="anchor"):
-        loaded(tmp_path, "a: &a [*a]\n")
-
-
 @pytest.mark.parametrize(("value", "unit", "text"), [
     (5_000_000, "ns", "5 ms"), (100_000_000, "ns", "100 ms"), (1.5, "s", "1.5 s"), (0.05, "m", "5 cm"),
     (math.radians(20), "rad", "20 deg"), (math.radians(60), "rad", "60 deg"), (0, "ns", "0"), (128, "px", "128"),
@@ -315,9 +314,3 @@ def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
     (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(UsageError, match=r"t.mcap is not text; give accurate, fast, paper, rover or a YAML file"):
         load(str(tmp_path / "t.mcap"))
-
-
-@pytest.mark.parametrize("text", ["", "source: {use: a.B}"])
-def test_an_incomplete_pipeline_file_names_a_file_to_start_from(tmp_path, text):
-    with pytest.raises(PipelineError, match=r"toy.yaml:1: .*; begin with a copy of .*/flow/pipelines/rover.yaml"):
-        loaded(tmp_path, text)

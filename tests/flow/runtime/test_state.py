@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pytest
-from mcap.reader import make_reader
 
 from flow.config.loader import load
 from flow.errors import PipelineError
 from flow.runtime.run import run
+from tests.conftest import mcap_rows
 from tests.flow.toys import PIPELINE, Couple, Log, graph
 from tests.flow.toys import traverse as numbers
 
@@ -106,17 +106,10 @@ def test_the_default_pipeline_keeps_nothing_between_runs(traverse, tmp_path):
     def result(name):
         with loaded.source.open(traverse, start=None, end=None) as log:
             summary = run(loaded, log, {use: tmp_path / name}, workers=1)
-        return messages(tmp_path / name), summary["findings"], summary["ledger"]
+        return mcap_rows(tmp_path / name), summary["findings"], summary["ledger"]
 
     first = result("first")
     with ThreadPoolExecutor(2) as pool:
         at_once = list(pool.map(result, ["second", "third"]))
     assert first[0]
     assert at_once == [first] * 2
-
-
-def messages(path):
-    """The messages of a result log."""
-    with path.open("rb") as stream:
-        found = make_reader(stream).iter_messages()
-        return [(channel.topic, message.log_time, message.data) for _, channel, message in found]
