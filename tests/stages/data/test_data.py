@@ -67,18 +67,42 @@ def test_small_arrays_are_copied():
     assert tilt.up.tolist() == [0, 0, 1]
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda bad: Pose(0, np.array([0, bad, 0]), QUATERNION, "odom", "base"), "Pose.position must be finite"),
-        (lambda bad: Pose(0, np.zeros(3), np.array([0, 0, bad, 1]), "odom", "base"), "Pose.quaternion must be finite"),
-        (lambda bad: Transform("a", "b", np.eye(3), np.array([bad, 0, 0])), "Transform.translation must be finite"),
-        (lambda bad: Tilt(0, np.array([0, 0, bad])), "Tilt.up must be finite"),
-        (lambda bad: Mount(0, np.diag([1, 1, bad])), "Mount.camera_from_inclinometer must be finite"),
-    ],
-)
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_values_that_are_not_finite_are_refused_by_name(make, message, bad):
+@dataclass(frozen=True)
+class Free(Stage):
+    """A stage whose parameter has no range."""
+
+    length: float = parameter(1.0, "any length", unit="m")
+
+
+WILD = np.nan, np.inf, -np.inf, F32("nan")
+SIZES = 0.0, -0.05, np.nan, np.inf
+NO_ROTATIONS = 2 * np.eye(3), np.diag([1.0, 1, -1]), np.ones((3, 3)), np.zeros((3, 3))
+REFUSALS = [
+    ("Pose.position must be finite", WILD, lambda bad: Pose(0, np.array([0, bad, 0]), QUATERNION, "odom", "base")),
+    ("Pose.quaternion must be finite", WILD, lambda bad: Pose(0, np.zeros(3), [0, 0, bad, 1], "odom", "base")),
+    ("Transform.translation must be finite", WILD, lambda bad: Transform("a", "b", np.eye(3), np.array([bad, 0, 0]))),
+    ("Tilt.up must be finite", WILD, lambda bad: Tilt(0, np.array([0, 0, bad]))),
+    ("Mount.camera_from_inclinometer must be finite", WILD, lambda bad: Mount(0, np.diag([1, 1, bad]))),
+    ("Mount.camera_from_inclinometer is not a rotation matrix", NO_ROTATIONS, lambda matrix: Mount(0, matrix)),
+    ("ElevationMap.resolution must be positive and finite", SIZES,
+     lambda size: ElevationMap(0, {"elevation": FLAT}, size, (0.0, 0.0), "level")),
+    ("NavigationMap.resolution must be positive and finite", SIZES,
+     lambda size: NavigationMap(0, np.zeros((2, 3), np.int8), np.zeros((2, 3), U8), size, (0.0, 0.0), "level")),
+    ("VoxelMap.resolution must be positive and finite", SIZES,
+     lambda size: VoxelMap(0, np.zeros((1, 3), np.int32), np.zeros((1, 3), U8), np.ones(1, np.int32), size, "level")),
+    ("images are 10x10, the calibration is for 640x480", [10],
+     lambda side: StereoFrame(0, *np.zeros((2, side, side), U8), CAMERA)),
+    ("left is uint8, right is uint16", [np.uint16],
+     lambda kind: StereoFrame(0, FRAME.left, FRAME.right.astype(kind), CAMERA)),
+    ("Free.length must be a finite number in m, not", WILD, lambda value: Free(length=value)),
+    ("Match.p2 must be a finite number, not", WILD, lambda value: Match(p2=value)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("bad", "make", "message"), [
+    (bad, make, message) for message, values, make in REFUSALS for bad in values
+])  # fmt: skip
+def test_values_that_cannot_be_used_are_refused_by_name(bad, make, message):
     with pytest.raises(ValueError, match=message):
         make(bad)
 
@@ -92,38 +116,8 @@ def test_a_stamp_that_is_not_whole_nanoseconds_is_refused(make, stamp):
         replace(item, stamp=stamp)
 
 
-@pytest.mark.parametrize("resolution", [0.0, -0.05, np.nan, np.inf])
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda size: ElevationMap(0, {"elevation": FLAT}, size, (0.0, 0.0), "level"),
-        lambda size: NavigationMap(0, np.zeros((2, 3), np.int8), np.zeros((2, 3), U8), size, (0.0, 0.0), "level"),
-        lambda size: VoxelMap(0, np.zeros((1, 3), np.int32), np.zeros((1, 3), U8), np.ones(1, np.int32), size, "level"),
-    ],
-)
-def test_a_resolution_that_is_not_positive_is_refused(make, resolution):
-    assert make(0.05).resolution == 0.05
-    with pytest.raises(ValueError, match=r"Map\.resolution must be positive and finite"):
-        make(resolution)
-
-
 def test_a_covariance_may_be_infinite():
     Pose(0, np.zeros(3), QUATERNION, "odom", "base", np.full((6, 6), np.inf))
-
-
-@pytest.mark.parametrize("matrix", [2 * np.eye(3), np.diag([1.0, 1, -1]), np.ones((3, 3)), np.zeros((3, 3))])
-def test_a_mount_that_is_not_a_rotation_is_refused(matrix):
-    with pytest.raises(ValueError, match=r"Mount\.camera_from_inclinometer is not a rotation matrix"):
-        Mount(0, matrix)
-
-
-@pytest.mark.parametrize(("left", "right", "message"), [
-    (np.zeros((10, 10), U8), np.zeros((10, 10), U8), "images are 10x10, the calibration is for 640x480"),
-    (np.zeros((480, 640), U8), np.zeros((480, 640), np.uint16), "left is uint8, right is uint16"),
-])  # fmt: skip
-def test_images_that_differ_from_the_calibration_or_in_depth_are_refused(left, right, message):
-    with pytest.raises(ValueError, match=message):
-        StereoFrame(0, left, right, CAMERA)
 
 
 def test_what_stages_derive_from_a_frame_is_made_once():
@@ -143,21 +137,6 @@ def test_poses_of_different_frames_are_not_interpolated(frames):
     assert first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, "odom", "base"), 1).position[0] == 2.0
     with pytest.raises(ValueError, match=f"of 'base' in 'odom' to the pose of '{frames[1]}' in '{frames[0]}'"):
         first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, *frames), 1)
-
-
-@dataclass(frozen=True)
-class Free(Stage):
-    """A stage whose parameter has no range."""
-
-    length: float = parameter(1.0, "any length", unit="m")
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, F32("nan")])
-def test_a_parameter_that_is_not_finite_is_refused(value):
-    with pytest.raises(ValueError, match=r"Free\.length must be a finite number in m, not"):
-        Free(length=value)
-    with pytest.raises(ValueError, match=r"Match\.p2 must be a finite number, not"):
-        Match(p2=value)
 
 
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (9,), (9, 3), (9, 1)])

@@ -1,7 +1,7 @@
 """Scenes with ground truth for the terrain tests: a plane with rocks in a camera's view, and terrain grids."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,22 +65,10 @@ class Terrain:
     rock: Array
 
 
-def rolling_terrain(
-    seed: int,
-    *,
-    amplitude: float = 0.0,
-    wavelength: float = 6.0,
-    slope: float = 0.0,
-    rocks: int = 12,
-    noise: float = 0.01,
-    cells: int = 160,
-    resolution: float = 0.05,
-) -> Terrain:
+def rolling_terrain(seed, *, amplitude=0.0, wavelength=6.0, slope=0.0, rocks=12, noise=0.01, cells=160) -> Terrain:
     """Sloping, rolling ground with half-ellipsoid rocks 0.22 to 0.5 m high, averaged over cells, all observed."""
-    random = np.random.default_rng(seed)
-    fine = 4
-    extent = cells * resolution / 2
-    axis = (np.arange(cells * fine) + 0.5) * resolution / fine - extent
+    random, fine, extent = np.random.default_rng(seed), 4, cells * 0.05 / 2
+    axis = (np.arange(cells * fine) + 0.5) * 0.05 / fine - extent
     x, y = np.meshgrid(axis, axis)
     heading, px, py = random.uniform(0, 2 * np.pi, 3)
     base = np.tan(slope) * (np.cos(heading) * x + np.sin(heading) * y)
@@ -97,15 +85,12 @@ def rolling_terrain(
         above = np.maximum(above, height * np.sqrt(np.maximum(inside, 0)))
         index[inside > 0] = len(placed)
 
-    def blocks(field: Array) -> Array:
+    def blocks(field):
         return field.reshape(cells, fine, cells, fine).swapaxes(1, 2).reshape(cells, cells, -1)
 
-    z = blocks(base + above)
-    error = noise * random.standard_normal((cells, cells))
-    layers = {"elevation": z.mean(-1), "minimum": z.min(-1), "maximum": z.max(-1)}
-    published = {name: (layer + error).astype(np.float32) for name, layer in layers.items()}
-    published["count"] = np.full((cells, cells), 16, np.float32)
-    grid = ElevationMap(7, published, resolution, (-extent, -extent), "level")
+    z, error = blocks(base + above), noise * random.standard_normal((cells, cells))
+    layers = {"elevation": z.mean(-1) + error, "minimum": z.min(-1) + error, "maximum": z.max(-1) + error}
+    grid = replace(map_of(**layers, count=np.full(error.shape, 16)), stamp=7, origin=(-extent, -extent))
     return Terrain(grid, blocks(above).mean(-1), blocks(index).max(-1))
 
 
