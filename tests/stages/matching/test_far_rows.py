@@ -109,8 +109,3 @@ def test_an_enlarged_sigma_is_double_as_the_disparity_is():
     large = Upsample(keep_sigma=True)(FRAME, small)
     assert np.array_equal(large.sigma[1::2, ::2], 2 * small.sigma)
     assert Upsample()(FRAME, small).sigma is None
-
-
-def test_a_step_of_the_prior_needs_a_prior():
-    with pytest.raises(ValueError, match=r"Match\.max_prior_step = 0\.1 m needs a `prior`"):
-        Match(max_prior_step=0.1)(FRAME)

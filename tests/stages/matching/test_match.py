@@ -292,6 +292,7 @@ def test_parameters_that_cannot_work_are_refused(kind, parameters, message):
      "max_depth = 0.5 m leaves nothing.* 60 px, and 47 px is the largest"),
     (Match(search_radius=4), (SLOPE,), "search_radius = 4 px needs a `prior`"),
     (Match(band_height=16), (SLOPE,), r"Match\.band_height = 16 px needs a `prior`"),
+    (Match(max_prior_step=0.1), (SLOPE,), r"Match\.max_prior_step = 0\.1 m needs a `prior`"),
     (Match(follow_slopes=True), (SLOPE,), "follow_slopes needs a `prior`"),
     (Match(), (SLOPE, TRUTH), r"prior must be a stages\.Disparity, not a ndarray"),
     (Match(), (SLOPE, disparity_of(TRUTH[:50])), r"prior has shape \(50, 320\)"),

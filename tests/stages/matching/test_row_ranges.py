@@ -15,7 +15,7 @@ from stages.matching.kernels.aggregation import aggregate_reference
 from stages.matching.kernels.gradient import smoothed_costs_reference
 from stages.matching.kernels.matching_inputs import matching_inputs
 from stages.matching.kernels.prior_cost import prior_costs, prior_costs_reference
-from stages.matching.kernels.row_ranges import Range, by_range, lanes_for, move_paths, row_ranges
+from stages.matching.kernels.row_ranges import Range, lanes_for, move_paths, row_ranges
 from stages.matching.kernels.selection import costs_reference, select_reference
 from stages.matching.kernels.semiglobal import match
 from stages.matching.kernels.texture import contrast, drop_unmatchable_reference
@@ -74,15 +74,6 @@ def test_a_band_that_is_mostly_unknown_also_has_the_range_of_the_bands_around_it
     ]
     prior[128:] = np.nan
     assert [(each.first, each.width.lanes) for each in row_ranges(prior, 64, 0, 192)] == 4 * [(0, 192)]
-
-
-@pytest.mark.parametrize("step", [1, -1])
-def test_rows_are_taken_in_their_order(step):
-    ranges = [Range(0, 4, 0, Width(16)), Range(4, 7, 0, Width(16)), Range(7, 20, 0, Width(16))]
-    parts = list(by_range(range(2, 9)[::step], ranges))
-    assert [y for part, _ in parts for y in part] == list(range(2, 9))[::step]
-    assert all(each.top <= y < each.end for part, each in parts for y in part)
-    assert len(parts) == 3
 
 
 @given(st.sampled_from([16, 64, 96, 128]), st.sampled_from([16, 64, 96, 128]), st.integers(-200, 200))

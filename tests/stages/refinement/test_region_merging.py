@@ -20,7 +20,7 @@ def test_regions_equal_the_reference(height, width, aimed, groups, seed):
     assert total == expected_total
 
 
-def test_a_region_does_not_cross_an_edge_between_superpixels():
+def test_neither_superpixels_nor_regions_cross_an_edge_of_the_image():
     image = np.full((120, 160), 60, np.uint8)
     image[:, 83:] = 180
     labels, count = superpixels(image, 120)
