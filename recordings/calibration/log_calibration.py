@@ -52,12 +52,12 @@ def calibrations_of_files(
 
 
 def _join(calibration: StereoCalibration, frames: list[str], inclinometer: str, tree: TransformTree) -> None:
-    """Add the transforms of the files to a tree."""
+    """Add the transforms of the files to a tree. Their frames may have other parents in the log."""
     left, right = frames
-    if calibration.right_in_left is not None:
-        tree.join(rigid(left, right, calibration.right_in_left))
-    if calibration.camera_from_imu is not None:
-        tree.join(rigid(left, inclinometer, calibration.camera_from_imu))
+    found = (right, calibration.right_in_left), (inclinometer, calibration.camera_from_imu)
+    joined = tree.joined(rigid(left, child, matrix) for child, matrix in found if matrix is not None)
+    tree.edges.update(joined.edges)
+    tree.calibrated.update(joined.edges)
 
 
 def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraModel:

@@ -147,7 +147,10 @@ def _validated(model: CameraModel, topic: str) -> CameraModel:
     """The calibration, with R = 1 and P = K if they are zero, as a single camera may leave them."""
     whose = f"the CameraInfo of {topic}"
     if model.k[0, 0] <= 0 and model.p[0, 0] <= 0:
-        raise LogError(f"the camera of {topic} is not calibrated (K and P of its CameraInfo are 0); calibrate it")
+        raise LogError(
+            f"the camera of {topic} is not calibrated (K and P of its CameraInfo are 0); set 'calibration' "
+            "of the source to its file"
+        )
     if not np.any(model.r):
         model = replace(model, r=np.eye(3))
     if not model.turns:

@@ -278,7 +278,7 @@ class SourceResolution:
     def _inclinometer_frame(self, topic: str) -> str:
         """The frame that the tilt is in: that of its messages, or the one whose poses they are."""
         if self.source.upright_frame is None:
-            own = INCLINOMETER if INCLINOMETER in self.static.parents else ""
+            own = INCLINOMETER if INCLINOMETER in self.static.edges else ""
             return self.messages.frame_of(topic) or own
         pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
         return "" if isinstance(pose, LogError) else pose.child_frame_id

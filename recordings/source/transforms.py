@@ -38,6 +38,8 @@ def rigid(parent: str, child: str, matrix: Any) -> Transform:
 class TransformTree:
     """Static transforms, by which any two connected frames have a transform.
 
+    calibrated: frames of calibration files, whose transforms win over those of the log.
+
     Examples
     --------
     >>> from recordings.ros2.to_msg import transform_message
@@ -52,6 +54,7 @@ class TransformTree:
 
     edges: dict[str, dict[str, Transform]] = field(default_factory=dict)
     parents: dict[str, str] = field(default_factory=dict)
+    calibrated: set[str] = field(default_factory=set)
 
     def add(self, message: Any) -> None:
         """Add a geometry_msgs/TransformStamped. Raises LogError if it contradicts those so far, which are kept."""
@@ -67,7 +70,7 @@ class TransformTree:
             self.edges.setdefault(parent, {})[child] = transform
             self.edges.setdefault(child, {})[parent] = transform.inverse()
             self.parents[child] = parent
-        elif not are_same(known, transform):
+        elif child not in self.calibrated and not are_same(known, transform):
             raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
 
     def between(self, parent: str, child: str) -> Transform | None:

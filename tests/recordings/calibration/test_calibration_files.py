@@ -14,7 +14,18 @@ from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
 from tests.conftest import data_folder
 from tests.recordings.calibration.euroc_bag import euroc_bag, euroc_rosbag2, kalibr_camchain
-from tests.recordings.sample_log import HEIGHT, INFOS, LEFT, RIGHT, WIDTH, dropped, items_of, write_sample
+from tests.recordings.sample_log import (
+    HEIGHT,
+    INFOS,
+    LEFT,
+    RIGHT,
+    TRANSFORMS,
+    WIDTH,
+    dropped,
+    items_of,
+    mounted,
+    write_sample,
+)  # fmt: skip
 
 INTRINSICS = [[458.6, 457.3, 367.2, 248.4], [457.6, 456.1, 379.9, 255.2]]
 K = [np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]) for fx, fy, cx, cy in INTRINSICS]
@@ -180,6 +191,21 @@ def test_a_camchain_with_the_right_camera_first_is_read_by_its_topics(tmp_path):
     written(path, cams)
     with McapSource(calibration=str(path)).open(log) as opened:
         assert opened.resolution.cameras is not None
+
+
+@pytest.mark.parametrize("nominal", [TRANSFORMS, TRANSFORMS[1:]], ids=["camera and Imu", "Imu"])
+def test_transforms_of_a_calibration_win_over_those_of_the_log(tmp_path, nominal):
+    (path,) = kalibr(tmp_path)
+    cams = yaml.safe_load(path.read_text())
+    for cam, topic in zip(cams.values(), (LEFT, RIGHT), strict=True):
+        cam.update(resolution=[WIDTH, HEIGHT], intrinsics=[20.0, 20.0, 11.5, 7.5], rostopic=topic)
+    written(path, cams)
+    with McapSource(calibration=str(path)).open(write_sample(tmp_path / "log.mcap", mounted(*nominal))) as opened:
+        assert opened.resolution.problems == []
+        camera_from_imu = opened.resolution.static.between("left_optical", "imu_link")
+        assert camera_from_imu is not None
+        np.testing.assert_allclose(camera_from_imu.rotation, CAMERA_FROM_IMU[:3, :3], atol=1e-9)
+        assert opened.resolution.static.between("base_link", "left_optical") is not None
 
 
 @pytest.mark.parametrize(("change", "sentence"), [
