@@ -56,7 +56,7 @@ class LogSettings:
     odometry: str | None = parameter(
         None,
         "topic of the pose: an Odometry, PoseStamped, PoseWithCovarianceStamped, or the TFMessage with base_frame; "
-        "none: no pose of the log",
+        "visual: visual odometry in place of it",
     )
     pitch: AngleField | None = parameter(None, "field of the pitch, for an inclinometer with bare angles")
     roll: AngleField | None = parameter(None, "field of the roll, for an inclinometer with bare angles")

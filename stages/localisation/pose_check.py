@@ -56,7 +56,7 @@ class PoseCheck:
             return (
                 f"Logged odometry disagrees with visual odometry: median step {np.median(logged):.2f} m vs "
                 f"{np.median(visual):.2f} m, difference {usual:.2f} m ({len(difference)} steps). Check its frame, its "
-                "heading and its unit, or set source.odometry to none: visual odometry then supplies the pose."
+                "heading and its unit, or set source.odometry to visual: visual odometry then supplies the pose."
             )
         jumps = difference[(difference > MIN_JUMP) & (difference > MIN_JUMP_RATIO * usual)]
         if len(jumps):

@@ -72,7 +72,7 @@ def register(stage: Stage, cloud: PointCloud, pose: Pose, mount: Mount | None = 
         raise StageError(
             f"{type(stage).__name__}: z of the pose's frame '{pose.frame_id}' is {np.degrees(lean):.0f} degrees off "
             "the vertical of the tilt; check the tilt, give a pose in a frame whose z points up, or set "
-            "source.odometry to none for visual odometry"
+            "source.odometry to visual"
         )
     yaw = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     rotation = turn_about_z(yaw)

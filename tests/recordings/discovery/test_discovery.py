@@ -111,8 +111,8 @@ def test_a_pose_among_results_is_named_but_not_used(tmp_path):
 
 
 def test_a_run_may_do_without_the_pose_of_the_log(tmp_path):
-    with McapSource(odometry="none").open(write_sample(tmp_path / "log.mcap")) as log:
-        assert log.missing == {"odometry": "the source's 'odometry' is set to none"}
+    with McapSource(odometry="visual").open(write_sample(tmp_path / "log.mcap")) as log:
+        assert log.missing == {"odometry": "the source's 'odometry' is set to visual"}
         assert log.refused == {}
 
 
