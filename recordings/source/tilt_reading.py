@@ -62,7 +62,7 @@ class TiltReading:
 
     @property
     def estimates(self) -> bool:
-        """Whether up is estimated from several messages."""
+        """Whether the tilt is estimated from several messages."""
         return self.kind == TiltKind.ESTIMATE
 
     def samplers(self, settings: LogSettings) -> dict[str, Callable[[Any, int], InertialSample]]:
