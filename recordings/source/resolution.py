@@ -216,8 +216,8 @@ class SourceResolution:
             return
         if joints and (others := other_joints(self.messages, joints)):
             self.refused["joints"] = f"the log has no angles of any joint in {self.source.joints}; {others}"
-        quaternion = "with the rotation from inclinometer to left camera, x, y, z, w"
-        self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0, 0, 0, 1]}, quaternion)]
+        ahead = "if x of the inclinometer points where the camera looks, and z up; a run then names a closer rotation"
+        self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0.5, -0.5, 0.5, 0.5]}, ahead)]
         self.unavailable["mount"] = str(mount)
 
     def _check_base_frame(self) -> None:

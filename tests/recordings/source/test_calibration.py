@@ -12,7 +12,7 @@ from recordings import McapSource
 from recordings.errors import LogError
 from recordings.ros2.to_msg import transform_message
 from recordings.source.calibration import calibrated_pair
-from recordings.source.transforms import TransformTree
+from recordings.source.transforms import BODY_FROM_OPTICAL, TransformTree
 from stages.data import CameraModel, Transform
 from tests.recordings.sample_log import (
     FRAMES,
@@ -241,6 +241,13 @@ def test_an_infinite_translation_is_reported_and_left_out(tmp_path):
         ((_, _, problem),) = losses_in(log.events())
     what = "the translation of the transform 'base_link' <- 'left_optical'"
     assert problem == f"/tf_static: {what} is [nan, 0.1, 0.9], which is not a position"
+
+
+def test_the_mount_that_is_offered_is_that_of_a_camera_that_looks_ahead(tmp_path):
+    with McapSource().open(write_sample(tmp_path / "log.mcap", dropped("/tf_static"))) as log:
+        (remedy,) = log.resolution.remedies["mount"]
+    offered = Rotation.from_quat(remedy.settings["camera_from_inclinometer"])
+    np.testing.assert_allclose(offered.apply(np.eye(3)), BODY_FROM_OPTICAL, atol=1e-12)
 
 
 def test_a_long_chain_of_transforms_is_followed():
