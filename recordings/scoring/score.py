@@ -39,6 +39,7 @@ TRUTHS = (
     "/truth/rocks", "/truth/tilt", "/truth/pose",
 )  # fmt: skip
 SCORED_LAYERS = {"elevation", "variance", "common_variance", "interpolated"}
+MAX_ORIGIN_ERROR = 0.01  # m, of the distance of a map's origin from the camera
 CAMERA_RTOL = 1e-3  # of focal length and baseline; cameras that differ by less are the same
 
 
@@ -267,9 +268,12 @@ class _Tally:
         if ground is None:
             raise LogError(f"{self.truth}: /truth at {stamp} ns lacks layers of the truth; simulate it again")
         fitting, unfit = dict[str, Any](), dict[str, str]()
+        elsewhere = self._elsewhere(frame)
         for topic, read in (("/nav/elevation_map", _layers), ("/nav/navigation_map", _cells)):
             try:
-                if topic in frame:
+                if topic in frame and elsewhere:
+                    unfit[topic] = elsewhere
+                elif topic in frame:
                     fitting[topic] = read(frame[topic], true)
             except ValueError as error:
                 unfit[topic] = str(error)
@@ -280,6 +284,17 @@ class _Tally:
         self.fitting |= bool(fitting)
         self.terrain = self.terrain or TerrainTally()
         return self.terrain.add(ground, fitting.get("/nav/elevation_map", {}), fitting.get("/nav/navigation_map"))
+
+    def _elsewhere(self, frame: dict[str, Any]) -> str:
+        """Why the maps of a frame have another origin than base_link, as those of the truth have; empty if unknown."""
+        for item in frame.get("/tf", ()):
+            mount = self.mounts.get(item.child_frame_id.removeprefix(OWN_FRAME))
+            if mount is not None and mount.header.frame_id == "base_link":
+                places = (each.transform.translation for each in (mount, item))
+                true, found = (float(np.linalg.norm([place.x, place.y, place.z])) for place in places)
+                if abs(found - true) > MAX_ORIGIN_ERROR:
+                    return f"its origin is {found:.2f} m from the camera, that of the truth, base_link, {true:.2f} m"
+        return ""
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
         """The tilt's error, by the camera that the truth knows. Viewers' pictures are children of frame `level` too."""

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -68,6 +69,7 @@ class Run:
     elevation: Callable[[np.ndarray], np.ndarray] = lambda layer: layer
     cells: Callable[[np.ndarray], np.ndarray] = lambda cells: cells
     tilt_error: float = 0.0
+    lower: float = 0.0  # m, by which the origin of the maps is below base_link
     crop: int = 0
     resolution: float = 0.05
     navigation: float | None = None  # its resolution, where it is another
@@ -103,7 +105,8 @@ class Run:
         origin = (-8 + self.crop * 0.05, -8 + self.crop * 0.05)
         level_from_camera = frame.level.inverse().after(frame.base.after(SMALL.mounts[0]))
         off = Rotation.from_rotvec([0.6 * self.tilt_error, 0.8 * self.tilt_error, 0]).as_matrix()
-        found = Transform("level", self.camera, off @ level_from_camera.rotation, level_from_camera.translation)
+        place = level_from_camera.translation + np.array([0.0, 0.0, self.lower])
+        found = Transform("level", self.camera, off @ level_from_camera.rotation, place)
         picture = Transform("level", "navigation_map/above", np.eye(3), np.zeros(3))  # of a viewer's picture of the map
         reason = np.zeros(cells.shape, np.uint8)
         return {
@@ -194,6 +197,13 @@ def test_maps_of_another_resolution_are_not_scored_but_all_else_is(tmp_path, tru
     assert max(map(len, format_score(found).splitlines())) <= 100
     assert main(["score", str(tmp_path / "out.mcap"), "--truth", str(truth)]) == 3
     assert scored(tmp_path, truth, frames, resolution=0.1, skipped=(1,)).terrain is None
+
+
+def test_maps_with_another_origin_than_base_link_are_not_scored(tmp_path, truth, frames):
+    found = scored(tmp_path, truth, frames, lower=0.1)
+    assert found.terrain is None
+    (reason,) = found.unscored["/nav/elevation_map"]
+    assert re.fullmatch(r"its origin is 1\.\d\d m from the camera, that of the truth, base_link, \d\.\d\d m", reason)
 
 
 def test_a_map_is_not_scored_if_the_other_map_does_not_fit(tmp_path, truth, frames):
