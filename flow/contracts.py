@@ -209,7 +209,7 @@ def unaliased(kind: Any) -> Any:
         return unaliased(kind.__value__)
     if origin in (Union, UnionType):
         return reduce(or_, map(unaliased, arguments))
-    if origin in (dict, list, tuple):
+    if origin in (dict, list, tuple, Mapping):
         return origin[tuple(map(unaliased, arguments))]
     return kind
 
