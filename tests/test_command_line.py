@@ -99,7 +99,7 @@ def test_a_log_without_a_pose_gets_a_visual_one_named_as_such(traverse, tmp_path
         true = start.after(simulation.base_at(simulation.stamp(index))).translation
         place = pose.pose.pose.position
         assert np.linalg.norm([place.x - true[0], place.y - true[1], place.z - true[2]]) < 0.03
-    sentence = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
+    sentence = f"Visual odometry supplies the pose ({FRAMES} poses, frame visual_odom)."
     assert json.loads(summary.read_text())["findings"]["pose"]["sentence"] == sentence
     assert f"pose: {sentence}" in printed
     assert {message.header.frame_id for message in regional} == {"visual_odom"}

@@ -116,7 +116,7 @@ class PoseFilter(Stage):
             if state.segment < 2:
                 return None
             return Finding(f"Visual odometry lost track {losses}. The poses are those of the log.")
-        source = f"The log contains no pose. Visual odometry supplies it ({counted(state.poses, 'pose')}"
+        source = f"Visual odometry supplies the pose ({counted(state.poses, 'pose')}"
         if state.segment < 2:
             return Finding(f"{source}, frame {VISUAL_FRAME}).")
         frames = f"{VISUAL_FRAME} {'and' if state.segment == 2 else 'to'} {_frame_of(state.segment)}"

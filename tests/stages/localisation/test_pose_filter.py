@@ -50,7 +50,7 @@ def test_visual_poses_of_base_link_follow_the_drive():
     np.testing.assert_allclose(poses[0].position, 0, atol=1e-12)
     assert np.linalg.norm(places[-1]) < 0.05  # of 12 m, from the noise of the first tilt
     assert np.abs(turns[:, 2]).max() < 0.1
-    sentence = f"The log contains no pose. Visual odometry supplies it ({FRAMES} poses, frame visual_odom)."
+    sentence = f"Visual odometry supplies the pose ({FRAMES} poses, frame visual_odom)."
     assert stage.finding() == Finding(sentence)
 
 
@@ -124,7 +124,7 @@ def test_poses_after_lost_tracking_are_in_a_frame_of_their_own():
     assert [pose.frame_id for pose in poses] == ["visual_odom"] * 3 + ["visual_odom/2"] * 3
     np.testing.assert_allclose(poses[3].position, 0, atol=1e-12)
     sentence = (
-        "The log contains no pose. Visual odometry supplies it (6 poses). It lost track 1 time: the poses are in 2 "
+        "Visual odometry supplies the pose (6 poses). It lost track 1 time: the poses are in 2 "
         "unaligned frames, visual_odom and visual_odom/2."
     )
     assert stage.finding() == Finding(sentence, Severity.WARNING)
