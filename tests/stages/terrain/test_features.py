@@ -106,6 +106,13 @@ def test_empty_cells_around_the_ground_do_not_change_the_features():
         np.testing.assert_allclose(found[name][patch], layer, atol=1e-6, err_msg=name)
 
 
+def test_a_plane_has_its_slope_under_the_footprint_and_under_a_wheel():
+    rows, cols = np.mgrid[:40, :40]
+    layers = TerrainFeatures()(map_of(0.05 * (0.2 * cols - 0.1 * rows))).layers
+    for name in ("slope", "steepness"):
+        np.testing.assert_allclose(layers[name], np.arctan(np.hypot(0.2, 0.1)), atol=1e-4, err_msg=name)
+
+
 def test_an_empty_map_has_unknown_features():
     nothing = TerrainFeatures()(map_of(np.full((60, 60), np.nan)))
     assert all(np.isnan(layer).all() for layer in nothing.layers.values())
