@@ -1,12 +1,13 @@
 """Tilts from ROS 2 messages, and the accelerations and rates to estimate them from.
 
-A tilt is a direction, never angles. A quaternion turns the world's z axis into the sensor's frame; plain pitch and roll
+A tilt is a direction, never angles. A quaternion turns the world's z axis into the sensor's frame; bare pitch and roll
 become a direction by the model in the pipeline file; accelerations at rest are the direction.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from functools import lru_cache
 from types import SimpleNamespace
@@ -160,7 +161,7 @@ def _number(message: Any, path: str) -> float:
             known = ", ".join(known for known in names if not known.startswith("_"))
             where = f"{_kind(value)} (it has {known})" if known else _kind(value)
             raise LogError(f"the message has no field '{path}': no '{name}' in its {where}")
-        value = value[int(name)] if name.isdecimal() else getattr(value, name)
+        value = value[int(name)] if _is_array(value) else getattr(value, name)
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise LogError(f"field '{path}' contains a {_kind(value)}, which is not a number")
     return float(value)
@@ -170,10 +171,14 @@ def _field_names(value: Any) -> list[str]:
     """The names of a message's fields, in any encoding; of an array the places of its numbers."""
     if hasattr(value, "DESCRIPTOR"):  # protobuf
         return [known.name for known in value.DESCRIPTOR.fields]
-    if hasattr(value, "__getitem__") and not isinstance(value, str):
+    if _is_array(value):
         return [str(place) for place in range(min(len(value), _MAX_PLACES))]
     names: list[str] = [*(getattr(value, "__dataclass_fields__", None) or getattr(value, "__dict__", {}))]
     return names
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, Sequence | np.ndarray) and not isinstance(value, str)
 
 
 def _kind(value: Any) -> str:
@@ -183,8 +188,8 @@ def _kind(value: Any) -> str:
 
 
 @dataclass(frozen=True)
-class PlainAngles:
-    """Converts plain pitch and roll to a direction in a sensor frame x forward, y left, z up.
+class BareAngles:
+    """Converts bare pitch and roll to a direction in a sensor frame x forward, y left, z up.
 
     A positive pitch is nose up, a positive roll left side up (both after `sign`). model "axis": angles of the x and y
     axis to the horizon, as an inclinometer measures. model "euler": pitch of the x axis, roll about the pitched x axis.

@@ -9,7 +9,7 @@ from typing import Any
 from flow.parameters import check_parameters, parameter
 from recordings.ros2.from_msg import frame_name
 from recordings.ros2.image_from_msg import MAX_PIXELS
-from recordings.ros2.tilt_from_msg import AccelerationField, AngleField, PlainAngles
+from recordings.ros2.tilt_from_msg import AccelerationField, AngleField, BareAngles
 
 MAX_RATE = 10_000  # Hz; fast inertial sensors have a tenth of it
 
@@ -90,7 +90,7 @@ class LogSettings:
         if given is not None and not _is_unit_quaternion(given):
             raise ValueError(f"McapSource.camera_from_inclinometer must be a unit quaternion x, y, z, w, not {given!r}")
 
-    def angles(self) -> PlainAngles | None:
+    def angles(self) -> BareAngles | None:
         """The meaning of bare angles; None if not set. Raises ValueError if only a part is set."""
         given = {"pitch": self.pitch, "roll": self.roll, "tilt_model": self.tilt_model}
         if not any(value is not None for value in given.values()):
@@ -99,7 +99,7 @@ class LogSettings:
             if value is None:
                 raise ValueError(f"McapSource needs '{name}': bare angles need pitch, roll and tilt_model")
         model: Any = self.tilt_model
-        return PlainAngles(self.pitch, self.roll, model)  # type: ignore[arg-type]  # none of them is None
+        return BareAngles(self.pitch, self.roll, model)  # type: ignore[arg-type]  # none of them is None
 
 
 def _is_unit_quaternion(given: Any) -> bool:

@@ -51,7 +51,7 @@ def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_
 
 
 def json_angles(path: Path, angles: list[dict[str, Any]], schema: bool) -> Path:
-    """A log of JSON messages with plain angles."""
+    """A log of JSON messages with bare angles."""
     form = ("Tilt", "jsonschema", b"{}") if schema else None
     rows = [("/tilt", "json", form, 10**9 + count, json.dumps(angle).encode()) for count, angle in enumerate(angles)]
     return write_mcap(path, rows, profile="")
@@ -85,14 +85,14 @@ def tilts_of(log: Path) -> list[Any]:
     return [item for _, _, item in items_of(log, source)]
 
 
-def test_plain_angles_in_a_protobuf_message_of_ones_own_are_a_tilt(tmp_path):
+def test_bare_angles_in_a_protobuf_message_of_ones_own_are_a_tilt(tmp_path):
     (tilt,) = tilts_of(protobuf_angles(tmp_path / "log.mcap", 5, 7, 2.0))
     assert tilt.stamp == 5_000_000_007
     assert np.degrees(np.arcsin(tilt.up[0])) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("schema", [True, False])
-def test_plain_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
+def test_bare_angles_in_json_are_a_tilt_at_their_own_time(tmp_path, schema):
     angles = [{"timestamp": {"sec": 5, "nsec": 7}, "body": {"pitch": 2.0, "roll": 0.0}}]
     (tilt,) = tilts_of(json_angles(tmp_path / "log.mcap", angles, schema))
     assert isinstance(tilt, Tilt)
@@ -111,6 +111,10 @@ def test_an_angle_may_be_a_number_of_an_array(data):
     assert AngleField("data.1", "rad", -1)(message) == -2.0
     with pytest.raises(LogError, match=r"no '2' in its (list|ndarray) \(it has 0, 1\)"):
         AngleField("data.2", "rad", 1)(message)
+
+
+def test_a_number_may_name_a_field_of_a_json_object():
+    assert AngleField("angles.0", "rad", 1)(SimpleNamespace(angles=SimpleNamespace(**{"0": 0.5}))) == 0.5
 
 
 @pytest.mark.parametrize("data", [
