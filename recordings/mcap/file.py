@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import cached_property
 from heapq import heapify, heappop, heappush
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from flow.contracts import counted
 from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
+from recordings.containers.recording import Recording
 from recordings.containers.timeline import MAX_LOG_TIME, Timeline
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import HEAD_BYTES, MAX_CHUNK_BYTES, check_size, chunk_heads, unpack_chunk
@@ -39,9 +40,6 @@ from recordings.mcap.index import (
 from recordings.mcap.message_order import ChunkMessages, LastTable, OpenChunks, Ordered, in_log_time_order, too_long
 from recordings.mcap.walk import walk
 from recordings.ros2.cdr import decoder_for, is_packed
-
-if TYPE_CHECKING:
-    from recordings.containers.recording import Recording
 
 Edges = tuple[int | None, int | None]  # log times, ns, from which and before which messages are read
 
