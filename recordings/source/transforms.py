@@ -70,7 +70,7 @@ class TransformTree:
             self.edges.setdefault(parent, {})[child] = transform
             self.edges.setdefault(child, {})[parent] = transform.inverse()
             self.parents[child] = parent
-        elif child not in self.calibrated and not are_same(known, transform):
+        elif not are_same(known, transform) and (child not in self.calibrated or self.parents.get(child) == parent):
             raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
 
     def between(self, parent: str, child: str) -> Transform | None:

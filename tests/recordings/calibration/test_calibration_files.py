@@ -1,5 +1,6 @@
 """Calibrations in the files of ROS, Kalibr, EuRoC and OpenCV, of a pair whose every number is known."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -193,15 +194,17 @@ def test_a_camchain_with_the_right_camera_first_is_read_by_its_topics(tmp_path):
         assert opened.resolution.cameras is not None
 
 
-@pytest.mark.parametrize("nominal", [TRANSFORMS, TRANSFORMS[1:]], ids=["camera and Imu", "Imu"])
-def test_transforms_of_a_calibration_win_over_those_of_the_log(tmp_path, nominal):
+@pytest.mark.parametrize(("nominal", "contradictions"), [
+    (TRANSFORMS, 0), (TRANSFORMS[1:], 0), ((*TRANSFORMS, replace(TRANSFORMS[0], translation=np.zeros(3))), 1),
+], ids=["camera and Imu", "Imu", "two places of the camera"])  # fmt: skip
+def test_transforms_of_a_calibration_win_over_those_of_the_log(tmp_path, nominal, contradictions):
     (path,) = kalibr(tmp_path)
     cams = yaml.safe_load(path.read_text())
     for cam, topic in zip(cams.values(), (LEFT, RIGHT), strict=True):
         cam.update(resolution=[WIDTH, HEIGHT], intrinsics=[20.0, 20.0, 11.5, 7.5], rostopic=topic)
     written(path, cams)
     with McapSource(calibration=str(path)).open(write_sample(tmp_path / "log.mcap", mounted(*nominal))) as opened:
-        assert opened.resolution.problems == []
+        assert len(opened.resolution.problems) == contradictions
         camera_from_imu = opened.resolution.static.between("left_optical", "imu_link")
         assert camera_from_imu is not None
         np.testing.assert_allclose(camera_from_imu.rotation, CAMERA_FROM_IMU[:3, :3], atol=1e-9)
