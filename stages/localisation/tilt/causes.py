@@ -184,8 +184,8 @@ def wrong_mount(fit: Fit) -> Cause:
     fault = f"the mount of the inclinometer is wrong by {degrees(angle)}"
     remedy = (
         f"It is rotated by {degrees(angle)} about axis ({along[0]:.2f}, {along[1]:.2f}, {along[2]:.2f}). Correct "
-        "/tf_static; if the camera is right in it, setting source.camera_from_inclinometer to "
-        f"[{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}] is enough."
+        "/tf_static. If the camera is right in it, or the log has none, set source.camera_from_inclinometer to "
+        f"[{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}] instead."
     )
     size, error = angle / MIN_ANGLE, sigma / MIN_ANGLE
     return fit.cause(fault, remedy, ups, 3, size=size, error=error, undone=turn @ mount)
