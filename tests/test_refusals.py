@@ -236,10 +236,8 @@ def test_a_link_to_itself_is_replaced_by_the_output(traverse, fast_result, tmp_p
     assert out.read_bytes() == fast_result.read_bytes()
 
 
-SIZE, SECONDS = (
-    "must be a number above 0 with MB, GB or TB, such as 4GB, not",
-    "must be seconds after the log's first message",
-)
+SIZE = "must be a number above 0 with MB, GB or TB, such as 4GB, not"
+SECONDS = "must be seconds after the log's first message"
 
 
 @pytest.mark.parametrize(("option", "value", "printed"), [

@@ -293,7 +293,7 @@ class _Tally:
                 places = (each.transform.translation for each in (mount, item))
                 true, found = (float(np.linalg.norm([place.x, place.y, place.z])) for place in places)
                 if abs(found - true) > MAX_ORIGIN_ERROR:
-                    return f"its origin is {found:.2f} m from the camera, that of the truth, base_link, {true:.2f} m"
+                    return f"its origin is {found:.2f} m from the camera, the truth's (base_link) {true:.2f} m"
         return ""
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:

@@ -203,7 +203,7 @@ def test_maps_with_another_origin_than_base_link_are_not_scored(tmp_path, truth,
     found = scored(tmp_path, truth, frames, lower=0.1)
     assert found.terrain is None
     (reason,) = found.unscored["/nav/elevation_map"]
-    assert re.fullmatch(r"its origin is 1\.\d\d m from the camera, that of the truth, base_link, \d\.\d\d m", reason)
+    assert re.fullmatch(r"its origin is 1\.\d\d m from the camera, the truth's \(base_link\) \d\.\d\d m", reason)
 
 
 def test_a_map_is_not_scored_if_the_other_map_does_not_fit(tmp_path, truth, frames):
