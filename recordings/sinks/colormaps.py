@@ -200,7 +200,8 @@ def birds_eyes(grids: Sequence[Array], factors: Sequence[float]) -> tuple[Array,
     views = np.empty((len(grids), *grids[0].shape[::-1]), np.float32)
     for view, grid, factor in zip(views, grids, factors, strict=True):
         np.multiply(grid.T[::-1, ::-1], np.float32(factor), out=view)
-    return views, views.astype(np.float16)
+    with np.errstate(over="ignore"):  # beyond 65504, such as seconds after 18 hours, a value is infinite
+        return views, views.astype(np.float16)
 
 
 def distance_lines(

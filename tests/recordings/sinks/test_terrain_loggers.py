@@ -11,6 +11,7 @@ from recordings.sinks.colormaps import (
     SOURCE_LEGEND,
     UNKNOWN_RGB,
     apply_palette,
+    birds_eyes,
     elevation_colors,
     fewer_shades,
 )  # fmt: skip
@@ -70,6 +71,12 @@ def test_slopes_are_drawn_in_degrees_as_their_limits_are_given(tmp_path):
     assert labels_of(path, "slope") == ["0 deg", "20 deg", "40 deg"]
     buffer = np.array(rows(path, "/elevation_map/layers/slope", "DepthImage:buffer")[0][2][0], np.uint8)
     np.testing.assert_allclose(buffer.view(np.float16), 20.0, atol=0.02)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_value_beyond_half_precision_is_infinite_without_a_warning():
+    _, halves = birds_eyes([np.array([[7.0, 1e5, np.nan]], np.float32)], [1.0])
+    np.testing.assert_array_equal(halves, [[[np.nan], [np.inf], [7]]])
 
 
 def test_the_scale_of_a_layer_shows_the_limit_of_the_hazard_rule(tmp_path):
