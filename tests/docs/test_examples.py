@@ -55,7 +55,7 @@ def test_the_mask_of_the_rovers_body_makes_its_pixels_unknown(written, tmp_path)
     masked = module.MaskBody(image=str(tmp_path / "body.png"))(disparity)
     np.testing.assert_array_equal(masked.pixels, [[7, np.nan]])
     np.testing.assert_array_equal(known(masked.source), [[True, False]])
-    with pytest.raises(StageError, match="is not an image"):
+    with pytest.raises(StageError, match="cannot be read as an image"):
         module.MaskBody(image="none.png")(disparity)
 
 
