@@ -153,6 +153,9 @@ def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
     earlier = changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 2})
     assert doubt in text_of(tmp_path, earlier)
     assert doubt not in text_of(tmp_path)
+    late, by = tmp_path / "late.mcap", {TILT: 20_000_000_000}
+    rewrite(tmp_path / "log.mcap", late, time=lambda topic, at: at + by.get(topic, 0))
+    assert "--set tilt.patience=22s" in format_description(inventory_of(late))
 
 
 @pytest.mark.parametrize("seconds", [100, -37])
@@ -164,12 +167,14 @@ def test_tilts_of_another_clock_are_doubted(tmp_path, seconds):
     assert "tilt.patience" not in text
 
 
-@pytest.mark.parametrize(("offset", "doubt"), [
-    (4, ""), (PERIOD // 2_000_000, ""),
-    (8, "differ by up to 8 ms; if they are taken at one time, --set stereo.slop=8ms pairs most of them"),
+WIDER = "differ by up to 8 ms; if they are taken at one time, --set stereo.slop=8ms pairs most of them"
+
+
+@pytest.mark.parametrize(("offset", "number", "doubt"), [
+    (4, FRAMES, ""), (PERIOD // 2_000_000, FRAMES, ""), (8, FRAMES, WIDER), (8, FRAMES - 2, WIDER),
 ])  # fmt: skip
-def test_images_that_a_wider_tolerance_would_pair_are_doubted(tmp_path, offset, doubt):
-    edit = changed(RIGHT, {"header.stamp.nanosec": lambda time: time + offset * 1_000_000})
+def test_images_that_a_wider_tolerance_would_pair_are_doubted(tmp_path, offset, number, doubt):
+    edit = changed(RIGHT, {"header.stamp.nanosec": lambda time: time + offset * 1_000_000}, range(number))
     path = write_sample(tmp_path / "log.mcap", edit)
     text = format_description(inventory_of(path))
     assert ("doubtful" in text, doubt in text) == (bool(doubt), True)
