@@ -92,7 +92,7 @@ def _calibration(path: Path) -> dict[str, Array]:
 
 def _entry(values: dict[str, Array], name: str, *shape: int) -> Array:
     if name not in values or values[name].size != int(np.prod(shape)):
-        raise LogError(f"KITTI's calibration lacks '{name}' with {int(np.prod(shape))} numbers; download them again")
+        raise LogError(f"KITTI's calibration lacks '{name}' with {int(np.prod(shape))} numbers; download it again")
     return values[name].reshape(shape)
 
 

@@ -81,11 +81,11 @@ def stereo_camera(projections: list[Array], size: tuple[int, int]) -> tuple[Ster
     """The rectified camera of two projections (3, 4), and (3,) m from the first camera's place to the left one's."""
     left, right = projections
     if not all(projection[0, 0] > 0 and projection[1, 1] > 0 and projection[2, 2] > 0 for projection in projections):
-        raise LogError("KITTI's calibration has a projection without a focal length; download them again")
+        raise LogError("KITTI's calibration has a projection without a focal length; download it again")
     shifts = [np.linalg.solve(projection[:, :3], projection[:, 3]) for projection in projections]
     baseline = float(shifts[0][0] - shifts[1][0])
     if not baseline > 0:
-        raise LogError(f"KITTI's calibration has a baseline of {baseline:g} m; download them again")
+        raise LogError(f"KITTI's calibration has a baseline of {baseline:g} m; download it again")
     camera = StereoCamera(
         fx=float(left[0, 0]), fy=float(left[1, 1]), cx=float(left[0, 2]), cy=float(left[1, 2]), baseline=baseline,
         width=size[0], height=size[1], cx_right=float(right[0, 2]), frame_id=LEFT,
