@@ -255,7 +255,9 @@ def test_the_shares_of_a_blind_map_are_in_its_row_of_a_table(tmp_path, truth, fr
 
 
 def test_the_columns_of_several_rows_have_their_units():
-    columns = brief_columns([[0.98, 0.03, 0.02, 0.5, 0.0125, 0, 0.25, 0.5], [1, 0, 0, 0, math.nan, 0, 0, 1]])
+    figures = [0.98, 0.03, 0.02, 0.5, 0.0125, 0, 0.25, 0.5]
+    columns = brief_columns([figures, [1, 0, 0, 0, math.nan, 0, 0, 1]])
+    assert brief_row("A", figures)[1:6] == ("98.00 %", "3.00 %", "2.00 %", "0.500", "1.25")
     assert columns["density (%)"] == [98, 100]
     assert columns["RMS (px)"] == [0.5, 0]
     assert columns["height (cm)"] == pytest.approx([1.25, math.nan], nan_ok=True)

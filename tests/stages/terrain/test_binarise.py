@@ -292,7 +292,7 @@ def test_lone_ground_is_unknown_and_a_lone_high_face_is_a_hazard():
 
 @pytest.mark.parametrize("method", ["rover", "absolute"])
 def test_a_cell_with_few_points_is_unsure_because_of_min_points(method):
-    count = np.full(LEVEL.shape, 5.0)
+    count = np.full(LEVEL.shape, 3.0)
     count[40, 40] = 2
     terrain, rule = TerrainFeatures()(map_of(LEVEL, count=count)), Binarise(method=method, min_points=3)
     assert rule(terrain).reason[40, 40] == CellReason.UNSURE

@@ -106,11 +106,12 @@ def test_empty_cells_around_the_ground_do_not_change_the_features():
         np.testing.assert_allclose(found[name][patch], layer, atol=1e-6, err_msg=name)
 
 
-def test_a_plane_has_its_slope_under_the_footprint_and_under_a_wheel():
+def test_a_rough_plane_has_its_slope_and_its_roughness():
     rows, cols = np.mgrid[:40, :40]
-    layers = TerrainFeatures()(map_of(0.05 * (0.2 * cols - 0.1 * rows))).layers
-    for name in ("slope", "steepness"):
-        np.testing.assert_allclose(layers[name], np.arctan(np.hypot(0.2, 0.1)), atol=1e-4, err_msg=name)
+    layers = TerrainFeatures()(map_of(0.05 * (0.2 * cols - 0.1 * rows) + 0.02 * (-1.0) ** (rows + cols))).layers
+    slope = np.arctan(np.hypot(0.2, 0.1))
+    for name, expected in (("slope", slope), ("steepness", slope), ("roughness", 0.02)):
+        np.testing.assert_allclose(layers[name][10:-10, 10:-10], expected, atol=1e-4, err_msg=name)
 
 
 def test_an_empty_map_has_unknown_features():
