@@ -20,8 +20,10 @@ from tests.recordings.sample_log import (
     INFOS,
     LEFT,
     RIGHT,
+    TILT,
     TRANSFORMS,
     WIDTH,
+    changed,
     dropped,
     items_of,
     mounted,
@@ -194,16 +196,28 @@ def test_a_camchain_with_the_right_camera_first_is_read_by_its_topics(tmp_path):
         assert opened.resolution.cameras is not None
 
 
+def kalibr_of_sample(folder: Path) -> str:
+    """The path of a calibration of the sample's cameras and Imu."""
+    (path,) = kalibr(folder)
+    cams = yaml.safe_load(path.read_text())
+    for cam, topic in zip(cams.values(), (LEFT, RIGHT), strict=True):
+        cam.update(resolution=[WIDTH, HEIGHT], intrinsics=[20.0, 20.0, 11.5, 7.5], rostopic=topic)
+    return str(written(path, cams))
+
+
+def test_a_tilt_without_a_frame_has_the_mount_of_the_calibration(tmp_path):
+    raw = "/cam0/image_raw", "/cam1/image_raw"
+    log = write_sample(tmp_path / "log.mcap", changed(TILT, {"header.frame_id": ""}), names=raw)
+    with McapSource(calibration=kalibr_of_sample(tmp_path)).open(log) as opened:
+        assert (opened.missing.get("mount"), opened.resolution.tilt_frame) == (None, "inclinometer")
+
+
 @pytest.mark.parametrize(("nominal", "contradictions"), [
     (TRANSFORMS, 0), (TRANSFORMS[1:], 0), ((*TRANSFORMS, replace(TRANSFORMS[0], translation=np.zeros(3))), 1),
 ], ids=["camera and Imu", "Imu", "two places of the camera"])  # fmt: skip
 def test_transforms_of_a_calibration_win_over_those_of_the_log(tmp_path, nominal, contradictions):
-    (path,) = kalibr(tmp_path)
-    cams = yaml.safe_load(path.read_text())
-    for cam, topic in zip(cams.values(), (LEFT, RIGHT), strict=True):
-        cam.update(resolution=[WIDTH, HEIGHT], intrinsics=[20.0, 20.0, 11.5, 7.5], rostopic=topic)
-    written(path, cams)
-    with McapSource(calibration=str(path)).open(write_sample(tmp_path / "log.mcap", mounted(*nominal))) as opened:
+    log = write_sample(tmp_path / "log.mcap", mounted(*nominal))
+    with McapSource(calibration=kalibr_of_sample(tmp_path)).open(log) as opened:
         assert len(opened.resolution.problems) == contradictions
         camera_from_imu = opened.resolution.static.between("left_optical", "imu_link")
         assert camera_from_imu is not None
