@@ -199,7 +199,7 @@ def test_the_part_of_a_log_of_several_files_is_scored_as_that_of_one(traverse, t
     half = len(rows) // 2
     files = [write_mcap(tmp_path / "a.mcap", rows[:half]), write_mcap(tmp_path / "b.mcap", rows[half:])]
     said(0, "run", *files, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--end", 1.1)
-    printed = said(0, "score", out, "--truth", *files).out
+    printed = said(0, "score", "--truth", files[0], "--truth", files[1], out).out
     assert printed.startswith("frames       2 of 2 have results\nnot counted  1 frame outside the part of the log ")
 
 

@@ -45,7 +45,7 @@ def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterato
     for where, line in read_lines(path):
         row = [value.strip() for value in line.rstrip(f"{separator or ''} ").split(separator)]
         if len(row) < columns:
-            raise LogError(f"{where} has {len(row)} columns, not at least {columns}; correct it or get it again")
+            raise LogError(f"{where} has only {len(row)} of {columns} columns; correct it or get it again")
         yield where, row
 
 

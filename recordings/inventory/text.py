@@ -68,7 +68,7 @@ def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
         yield f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s; record both with one"
     elif late > MAX_TILT_DELAY:
         remedy = f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them"
-        yield f"tilts are logged {late:.1f} s later after their stamps than images; {remedy}"
+        yield f"tilts arrive in the log {late:.1f} s later than images of the same stamp; {remedy}"
 
 
 def _table(topics: list[dict[str, Any]], roles: dict[str, str]) -> list[str]:

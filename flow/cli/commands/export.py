@@ -30,8 +30,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="write the elevation or navigation map of this stream, not the regional map",
     )  # fmt: skip
     sub.add_argument("--crs", metavar="CRS", help="georeference the regional map by fixes: utm, or a zone (EPSG:32633)")
-    fixes = "log with the GNSS fixes: files or a folder (the result itself, or its input beside it)"
-    sub.add_argument("--fixes", type=Path, nargs="+", metavar="LOG", help=fixes)
+    fixes = "log with the GNSS fixes, a file or a folder; repeatable (the result itself, or its input beside it)"
+    sub.add_argument("--fixes", type=Path, action="append", metavar="LOG", help=fixes)
     one_map = "merge the regional maps of several logs into one; their poses must be in one frame"
     sub.add_argument("--merge", action="store_true", help=one_map)
 

@@ -15,8 +15,8 @@ HELP = "print the errors of a result log, or of the logs of a fleet, against gro
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log, or the folder of a fleet")
-    truth = "log with the /truth topics: files or a folder (the result itself)"
-    sub.add_argument("--truth", type=Path, nargs="+", metavar="LOG", help=truth)
+    truth = "log with the /truth topics, a file or a folder; repeatable (the result itself)"
+    sub.add_argument("--truth", type=Path, action="append", metavar="LOG", help=truth)
     sub.add_argument("--json", type=Path, metavar="FILE", help="write all figures as JSON")
 
 

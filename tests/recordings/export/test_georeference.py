@@ -89,7 +89,7 @@ def test_the_fixes_of_all_files_of_an_input_count(result, tmp_path, said):
             log.write(topic, message, stamp)
     for name, part in (("a", slice(0, 1)), ("b", slice(1, None))):
         write_fixes(tmp_path / f"{name}.mcap", stamps[part], on_grid(places[part], scale_at(ORIGIN[0])))
-    for number, fixes in enumerate([(), ("--fixes", tmp_path / "b.mcap", tmp_path / "a.mcap")]):
+    for number, fixes in enumerate([(), ("--fixes", tmp_path / "b.mcap", "--fixes", tmp_path / "a.mcap")]):
         printed = said(0, "export", out, tmp_path / f"maps-{number}", "--crs", "utm", *fixes).out
         assert f"by {FRAMES} fixes: residual 0.00 m RMS" in printed
 

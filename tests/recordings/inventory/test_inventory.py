@@ -149,7 +149,7 @@ def test_streams_without_stamps_are_noted(tmp_path):
 
 
 def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
-    doubt = "doubtful: tilts are logged 2.0 s later after their stamps than images; if no clock is wrong"
+    doubt = "doubtful: tilts arrive in the log 2.0 s later than images of the same stamp; if no clock is wrong"
     earlier = changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 2})
     assert doubt in text_of(tmp_path, earlier)
     assert doubt not in text_of(tmp_path)
