@@ -131,7 +131,7 @@ def test_cameras_in_the_wrong_order_are_refused(recording, tmp_path, refused):
 
 @pytest.mark.parametrize(("name", "old", "new", "words"), [
     ("imu0/data.csv", "1700086", "1.7E+18", "spreadsheets round stamps"),
-    ("cam0/data.csv", ",", ";", "has 1 columns"),
+    ("cam0/data.csv", ",", ";", "has only 1 of 2 columns"),
     ("cam1/sensor.yaml", "pinhole", "omni", "the camera model 'omni'"),
     ("imu0/data.csv", None, None, "cannot read"),
     ("cam0/sensor.yaml", None, None, "give --calibration"),
