@@ -67,7 +67,7 @@ class _Announcement(event.Listener):
     def on_start(self, event: Any) -> None:
         if not self.made and str(event.data["dispatcher"].py_func.__module__).startswith("stages."):
             self.made = True
-            log.warning("compiling kernels, once for this machine and these settings; all of them take half a minute or more")
+            log.warning("compiling kernels, once for this machine and these settings; all of them take half a minute")
 
     def on_end(self, event: Any) -> None:
         pass
