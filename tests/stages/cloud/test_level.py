@@ -76,6 +76,13 @@ def test_the_level_frame_has_the_origin_and_heading_of_base_link():
     np.testing.assert_allclose(transform.rotation, aside, atol=1e-12)
 
 
+def test_a_point_on_the_axis_of_a_nose_up_camera_is_above_it():
+    a = np.deg2rad(10)
+    up = np.array([0, -np.cos(a), np.sin(a)])
+    cloud = Level(camera_height=0)(cloud_of(np.array([[0, 0, 8.0]])), Tilt(0, up), BARE)
+    np.testing.assert_allclose(cloud.points[0], [8 * np.cos(a), 0, 8 * np.sin(a)], atol=1e-6)
+
+
 def test_only_a_tilt_in_the_frame_of_the_camera_needs_no_mount():
     cloud = cloud_of(POINTS, "left_optical")
     alone = Level()(cloud, Tilt(0, UP, "left_optical"))

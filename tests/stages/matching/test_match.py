@@ -151,9 +151,9 @@ def test_what_is_nearer_than_the_range_is_unknown_or_the_priors():
 def test_sixteen_bits_and_colour_match_like_eight_bits_and_gray(match, border, largest):
     deep = frame_of(SLOPE.left.astype(np.uint16) * 9 + 700, SLOPE.right.astype(np.uint16) * 9 + 700)
     assert same(match(COLOURED), match(SLOPE))
-    known, error, _ = accuracy(match(deep).pixels, TRUTH, np.arange(320) >= TRUTH + border)
-    assert known > 0.95
-    assert error < largest
+    pixels = match(deep).pixels
+    assert np.isfinite(pixels)[np.arange(320) >= TRUTH + border].mean() > 0.95
+    assert np.nanmedian(np.abs(pixels - TRUTH)) < largest
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])

@@ -141,6 +141,15 @@ def test_a_mirrored_map_gives_the_mirrored_result(seed):
     assert (decided(mirrored).cells[::-1] != decided(elevation).cells).mean() <= 0.0005
 
 
+def test_a_rock_on_a_slope_is_a_hazard_and_the_slope_is_free():
+    distance = np.hypot(X - 2, Y - 2)
+    rock = np.where(distance < 0.3, np.sqrt(np.maximum(0.09 - distance**2, 0)), 0)
+    result = decided(map_of(np.tan(np.deg2rad(10)) * X + rock))
+    assert (result.reason[distance < 0.18] == CellReason.STEP).all()
+    assert (result.cells[distance > 0.45] == Cell.FREE).all()
+    assert (result.cells[distance > 0.35] == Cell.FREE).mean() > 0.98
+
+
 @pytest.mark.parametrize("step", [0.12, 0.16, 0.18, 0.25])
 @pytest.mark.parametrize("limit", [0.14, 0.17, 0.22])
 @pytest.mark.parametrize("degrees", [0.0, 12.0])
