@@ -91,6 +91,10 @@ def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_p
     assert (source["left"], source["right"], source["inclinometer"]) == (LEFT, RIGHT, TILT)
     assert roverflow("info", log, "-p", written) == 0
     assert "exists; choose another name" in refused("info", log, "--write-pipeline", written)
+    late = ["-p", written, "--set", "source.time_offset.inclinometer=-150ms"]
+    assert roverflow("info", log, *late, "--write-pipeline", tmp_path / "late.yaml") == 0
+    assert yaml.safe_load((tmp_path / "late.yaml").read_text())["source"]["time_offset"] == {"inclinometer": "-150 ms"}
+    assert roverflow("info", log, "-p", tmp_path / "late.yaml") == 0
     named = write_sample(tmp_path / "named.mcap", names=("/a/picture", "/b/picture"))
     assert roverflow("info", named, "--write-pipeline", tmp_path / "other.yaml") == 2
     assert "  #   left: /a/picture\n  #   right: /b/picture\n" in (tmp_path / "other.yaml").read_text()

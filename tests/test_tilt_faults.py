@@ -4,6 +4,7 @@ The logs are simulated traverses with an inclinometer noise of 0.3 degrees a sam
 """
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +36,11 @@ def log(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return path
 
 
-def finding_of(log: Path, folder: Path, code: int) -> tuple[str, str]:
+def finding_of(log: Path, folder: Path, code: int, *options: str) -> tuple[str, str]:
     """Severity and sentence of the finding about the tilt, of a run that exits with a code."""
     pipeline, summary = folder / "check.yaml", folder / "summary.json"
     pipeline.write_text(PIPELINE)
-    arguments = ["-p", pipeline, "-o", folder / "out.mcap", "--no-rrd", "--summary", summary]
+    arguments = ["-p", pipeline, "-o", folder / "out.mcap", "--no-rrd", "--summary", summary, *options]
     assert main(["run", *map(str, [log, *arguments])]) == code
     findings = json.loads(summary.read_text())["findings"]
     assert "warning" not in {other["severity"] for other in findings.values()}  # such as one that blames the pose
@@ -65,6 +66,17 @@ def test_a_fault_is_named(log, tmp_path, fault):
     fault = found.split(". ")[0].lower()
     assert name in fault, found
     assert " or " not in fault, found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", ["late", "early"])
+def test_the_setting_that_the_check_names_corrects_late_and_early_stamps(log, tmp_path, fault):
+    faulty = FAULTS[fault][0](log, tmp_path / "faulty.mcap")
+    _, found = finding_of(faulty, tmp_path, 3)
+    named = re.search(r"Set (source\.time_offset\.inclinometer) to (-?\d+ ms)", found)
+    assert named is not None, found
+    severity, _ = finding_of(faulty, tmp_path, 0, "--set", f"{named[1]}={named[2]}")
+    assert severity == "note"
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import re
 import shlex
 from argparse import Namespace
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import yaml
@@ -19,6 +19,7 @@ from flow.contracts import counted
 from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted
+from flow.units import as_written
 from recordings.inventory.search_range import ROCK
 
 if TYPE_CHECKING:
@@ -135,7 +136,12 @@ def _settings(values: Mapping[str, Any]) -> str:
 def _flow(value: Any) -> str:
     """A value as YAML in one line."""
     value = list(value) if isinstance(value, tuple) else value
-    value = dict(vars(value)) if hasattr(value, "__dataclass_fields__") else value
+    if is_dataclass(value):
+        own = [(known, getattr(value, known.name)) for known in fields(value)]
+        units = {known.name: known.metadata["unit"] for known, part in own if part != known.default}
+        value = {
+            name: as_written(vars(value)[name], unit) if unit else vars(value)[name] for name, unit in units.items()
+        }
     return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).removesuffix("...\n").strip()
 
 

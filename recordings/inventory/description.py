@@ -85,6 +85,7 @@ def describe(
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
             "delay_s": [float(np.quantile(delays, part)) / 1e9 for part in (0, 0.5, 1)] if delays else None,
             "tilt_delay_s": float(np.median(of_tilts)) / 1e9 if of_tilts else None,
+            "tilt_offset_s": log.time_offset("inclinometer") / 1e9,
         },
         "transforms": resolution.static.listed(),
         "mount": _mount(log),
@@ -136,7 +137,7 @@ def _stamps(log: McapLog, stream: str, damage: Damage, delays: array[int] | None
     topic, stamps = log.topics[stream], array("q")
     for raw in (log.file.messages if _is_verified(log) else log.file.heads)(log.channels(stream)):
         if not isinstance(raw, LostMessage):
-            stamps.append(log.stamp_of(raw) or raw.log_time)
+            stamps.append(log.stamp_of(raw, stream))
             if delays is not None:
                 delays.append(raw.log_time - stamps[-1])
         elif raw.channel is not None:

@@ -64,10 +64,14 @@ def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
         remedy = f"if they are taken at one time, --set stereo.slop={math.ceil(offset * 1e3)}ms pairs most of them"
         yield f"the stamps of left and right images differ by up to {offset * 1e3:.3g} ms; {remedy}"
     late = (frames["tilt_delay_s"] or 0) - (frames["delay_s"] or [0, 0])[1]
+    corrected = f"--set source.time_offset.inclinometer={frames['tilt_offset_s'] + late:.3f}s corrects the tilts"
     if abs(late) > MAX_LATENESS_NS / 1e9 and frames["with_tilt"] == 0:
-        yield f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s; record both with one"
+        differ = f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s"
+        yield f"{differ}; record both with one; {corrected}, if both are logged equally soon"
     elif late > MAX_TILT_DELAY:
-        remedy = f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them"
+        remedy = (
+            f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them; else {corrected}"
+        )
         yield f"tilts arrive in the log {late:.1f} s later than images of the same stamp; {remedy}"
 
 

@@ -125,16 +125,17 @@ class McapLog:
         for edge in part.edges if "left" in self.topics else ():
             for raw in self.file.messages(self.channels("left"), edge - MAX_JITTER_NS, edge + EDGE_NS):
                 if isinstance(raw, RawMessage):
-                    yield self.stamp_of(raw), raw.log_time
+                    yield self.stamp_of(raw, "left"), raw.log_time
 
     def _between(
         self, part: TimeRange, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS
     ) -> Iterator[tuple[int, str, Any]]:
-        events = self._read(part, frames, streams, ahead)
-        tilt = self.resolution.tilt
-        if "inclinometer" not in streams or "inclinometer" not in self.topics or tilt is None or not tilt.estimates:
-            return events
-        return merge(events, self._estimated(tilt, part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
+        events, tilt = self._read(part, frames, streams, ahead), self.resolution.tilt
+        if "inclinometer" in streams and "inclinometer" in self.topics and tilt is not None and tilt.estimates:
+            events = merge(events, self._estimated(tilt, part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
+        for log_time, stream, item in events:
+            offset = 0 if isinstance(item, Exception) else self.time_offset(stream)
+            yield log_time, stream, replace(item, stamp=item.stamp + offset) if offset else item
 
     def _estimated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
         """The estimates of up in a part of the log, also from samples before and after."""
@@ -195,7 +196,7 @@ class McapLog:
                 yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
                 continue
             is_inside = not part.edges or (
-                frames.has(reader.stream, self.stamp_of(raw), raw.log_time)
+                frames.has(reader.stream, self.stamp_of(raw, reader.stream), raw.log_time)
                 if reader.stream in CAMERAS
                 else near.has(0, raw.log_time)
             )
@@ -263,9 +264,14 @@ class McapLog:
             found["mount"] = Finding(f"{self.notes()['mount']}; {gaps}", Severity.WARNING)
         return found
 
-    def stamp_of(self, raw: RawMessage) -> int:
-        """The header stamp of a message, ns; 0 if there is none."""
-        return self.resolution.messages.stamp_of(raw)
+    def stamp_of(self, raw: RawMessage, stream: str) -> int:
+        """The stamp of a message as an item of a stream, ns."""
+        return (self.resolution.messages.stamp_of(raw) or raw.log_time) + self.time_offset(stream)
+
+    def time_offset(self, stream: str) -> int:
+        """The time that is added to the stamps of a stream, ns."""
+        offset: int = getattr(self.source.time_offset, stream, 0)
+        return offset
 
     def channels(self, stream: str) -> set[int]:
         """The channels of a stream."""
@@ -296,7 +302,7 @@ class McapLog:
             return
         ranges = part, part.widened(MAX_LATENESS_NS)  # in the first one is an image, unless stamps and log times differ
         raws = chain.from_iterable(self.file.messages(self.channels("left"), each.low, each.high) for each in ranges)
-        if not any(isinstance(raw, LostMessage) or part.has(self.stamp_of(raw), raw.log_time) for raw in raws):
+        if not any(isinstance(raw, LostMessage) or part.has(self.stamp_of(raw, "left"), raw.log_time) for raw in raws):
             length = (self.file.end - self.file.start) / 1e9
             until = "its end" if self.end is None else f"{self.end:g} s"
             raise LogError(

@@ -6,12 +6,21 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from flow.parameters import check_parameters, parameter
+from flow.parameters import Checked, check_parameters, parameter
 from recordings.ros2.from_msg import frame_name
 from recordings.ros2.image_from_msg import MAX_PIXELS
 from recordings.ros2.tilt_from_msg import AccelerationField, AngleField, BareAngles
 
 MAX_RATE = 10_000  # Hz; fast inertial sensors have a tenth of it
+
+
+@dataclass(frozen=True)
+class TimeOffsets(Checked):
+    """Times that are added to the stamps of streams, so that they fit those of the left images."""
+
+    right: int = parameter(0, "time added to the stamps of the right images", unit="ns")
+    inclinometer: int = parameter(0, "time added to the stamps of the tilts, negative if they are late", unit="ns")
+    odometry: int = parameter(0, "time added to the stamps of the poses, negative if they are late", unit="ns")
 
 
 @dataclass(frozen=True)
@@ -73,6 +82,7 @@ class LogSettings:
     joints: str | None = parameter(
         None, "YAML file of the joints that move the camera on the rover; a JointState has their angles"
     )
+    time_offset: TimeOffsets | None = parameter(None, "times added to the stamps of other streams than the left images")
     max_pixels: int = parameter(MAX_PIXELS, "largest number of pixels of an image", low=1)
     max_rate: int = parameter(
         MAX_RATE, "highest message rate of a topic, over ten seconds of log time",

@@ -146,4 +146,4 @@ def _stamps(log: McapLog, times: NDArray[np.int64], place: int, reach: int = 2) 
     """Log time -> stamp, ns, of the left image at a place and of those within `reach` of it."""
     first, last = times[max(0, place - reach)], times[min(place + reach, times.size - 1)]
     raws = (raw for raw in log.file.messages(log.channels("left"), first, last + 1) if isinstance(raw, RawMessage))
-    return {raw.log_time: log.stamp_of(raw) or raw.log_time for raw in raws}
+    return {raw.log_time: log.stamp_of(raw, "left") for raw in raws}

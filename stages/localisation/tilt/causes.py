@@ -225,7 +225,10 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
     misfit_best, misfit_sound = misfits(late, 0.0)
     gained = misfit_sound - misfit_best
     fault = f"the tilt's stamps are {abs(late) * 1000:.0f} ms {'late' if late > 0 else 'early'}"
-    remedy = "Check the clocks of camera and inclinometer, and delays in the driver."
+    remedy = (
+        f"Set source.time_offset.inclinometer to {-late * 1000:.0f} ms, plus its present value, or correct the clocks "
+        "or the driver."
+    )
     return Cause(
         fault, remedy, max(sound.misfit - gained, misfit_best), sound.ground, 1, abs(late) / MIN_OFFSET,
         float(np.sqrt(2 / curvature)) / MIN_OFFSET,

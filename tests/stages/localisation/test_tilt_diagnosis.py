@@ -90,6 +90,7 @@ def test_a_time_offset_is_named_with_its_size(drive, late):
     assert size is not None, found.sentence
     assert size[2] == ("late" if late > 0 else "early")
     assert abs(int(size[1]) - 200) < 50
+    assert f"Set source.time_offset.inclinometer to {'-' if late > 0 else ''}{size[1]} ms" in found.sentence
 
 
 @pytest.mark.parametrize("late", [0.2, 0.1, -0.2])

@@ -1,0 +1,83 @@
+"""`source.time_offset` corrects the stamps of one stream against the left images."""
+
+import pytest
+
+from recordings import McapSource
+from recordings.inventory.description import describe
+from recordings.inventory.text import format_description
+from recordings.source.settings import TimeOffsets
+from tests.recordings.sample_log import (
+    PERIOD,
+    RIGHT,
+    TILT,
+    UNSTAMPED,
+    Edit,
+    Event,
+    changed,
+    dropped,
+    essences,
+    inventory_of,
+    items_of,
+    losses_in,
+    write_sample,
+)  # fmt: skip
+
+LATE = 30_000_000  # ns
+TOPICS = {"right": RIGHT, "inclinometer": TILT, "odometry": "/odom"}
+
+
+def later(topic: str, by: int = LATE) -> Edit:
+    """An edit for `write_sample`: later stamps."""
+    return changed(topic, {"header.stamp.nanosec": lambda time: time + by})
+
+
+@pytest.mark.parametrize("stream", TOPICS)
+def test_an_offset_undoes_a_constant_latency_and_keeps_log_times(sample, tmp_path, stream):
+    late = write_sample(tmp_path / "late.mcap", later(TOPICS[stream]))
+    whole = essences(items_of(sample))
+    assert essences(items_of(late)) != whole
+    assert essences(items_of(late, McapSource(time_offset=TimeOffsets(**{stream: -LATE})))) == whole
+
+
+def test_messages_without_a_stamp_are_moved_from_their_log_times(sample, tmp_path):
+    path = write_sample(tmp_path / "log.mcap", changed(TILT, UNSTAMPED))
+    assert essences(items_of(path)) == essences(items_of(sample))
+    stamps = stamps_of(items_of(path, McapSource(time_offset=TimeOffsets(inclinometer=LATE))))
+    assert stamps == [stamp + LATE for stamp in stamps_of(items_of(sample))]
+
+
+def test_a_lost_message_stays_a_loss(tmp_path):
+    path = write_sample(tmp_path / "log.mcap", changed(TILT, {"orientation.x": 5.0}, [3]))
+    source = McapSource(time_offset=TimeOffsets(inclinometer=LATE))
+    assert losses_in(items_of(path, source)) == losses_in(items_of(path))
+
+
+def test_a_range_has_both_images_of_a_frame_by_corrected_stamps(tmp_path):
+    late = write_sample(tmp_path / "late.mcap", later(RIGHT, PERIOD))
+    events = items_of(late, McapSource(time_offset=TimeOffsets(right=-PERIOD)), start=0.1, end=0.3)
+    left, right = ([item.stamp for _, stream, item in events if stream == side] for side in ("left", "right"))
+    assert left == right
+    assert len(left) == 2
+
+
+def test_info_counts_pairs_and_tilts_by_corrected_stamps(tmp_path):
+    late = write_sample(tmp_path / "late.mcap", later(RIGHT), dropped(TILT, numbers=[1, 2, 3]), later(TILT))
+    assert [inventory_of(late)["frames"][name] for name in ("pairs", "with_tilt")] == [0, 0]
+    with McapSource(time_offset=TimeOffsets(right=-LATE, inclinometer=-LATE)).open(late) as log:
+        frames = describe(log, max_gap_of=lambda intervals: 4 * PERIOD)["frames"]
+    assert [frames[name] for name in ("pairs", "with_tilt")] == [5, 5]
+
+
+@pytest.mark.parametrize("seconds", [100, -37])
+def test_info_names_the_offset_of_another_clock(tmp_path, seconds):
+    path = write_sample(tmp_path / "log.mcap", changed(TILT, {"header.stamp.sec": lambda stamp: stamp + seconds}))
+    setting = f"--set source.time_offset.inclinometer={-seconds}.000s corrects the tilts"
+    assert setting in format_description(inventory_of(path))
+    for given in (-seconds, -seconds + 5):
+        with McapSource(time_offset=TimeOffsets(inclinometer=given * 1_000_000_000)).open(path) as log:
+            text = format_description(describe(log, max_gap_of=lambda intervals: 2 * PERIOD))
+        assert (setting in text) == (given != -seconds)
+
+
+def stamps_of(events: list[Event]) -> list[int]:
+    return [item.stamp for _, stream, item in events if stream == "inclinometer"]
