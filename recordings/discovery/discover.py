@@ -27,7 +27,7 @@ from recordings.source.settings import LogSettings
 from recordings.source.topics import MAX_TRIED, DecodedTopics
 
 _MAX_LISTED = 5  # frames in a sentence
-_VISUAL = "visual"  # the value of the setting 'odometry' by which a run does without the log's pose
+VISUAL = "visual"  # the value of the setting 'odometry' by which a run does without the log's pose
 _TRUTH = "/truth/"  # the simulator's ground truth, used only if a setting names it
 
 
@@ -62,8 +62,8 @@ def _find_pose(
     topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
 ) -> None:
     poses = [topic for topic in topics if topic.schema in POSES and topic.messages]
-    if settings.odometry == _VISUAL:
-        found.missing["odometry"] = f"the source's 'odometry' is set to {_VISUAL}"
+    if settings.odometry == VISUAL:
+        found.missing["odometry"] = f"the source's 'odometry' is set to {VISUAL}"
         return
     moving = [topic for topic in topics if topic.schema == TRANSFORMS and not topic.name.endswith("tf_static")]
     if settings.odometry is not None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
+from recordings.discovery.discover import VISUAL
 from recordings.inventory.search_range import search_range
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory
@@ -90,7 +91,11 @@ def describe(
         "transforms": resolution.static.listed(),
         "mount": _mount(log),
         "search_range": _search_range(log),
-        "missing": dict(resolution.unavailable),
+        "missing": {
+            stream: why
+            for stream, why in resolution.unavailable.items()
+            if stream != "odometry" or log.source.odometry != VISUAL
+        },
         "remedies": {
             stream: [asdict(remedy) for remedy in remedies]
             for stream, remedies in resolution.remedies.items()

@@ -10,7 +10,7 @@ import numpy as np
 from flow.contracts import Finding, counted
 from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
-from recordings.discovery.discover import discover
+from recordings.discovery.discover import VISUAL, discover
 from recordings.discovery.roles import IMU, TRANSFORMS, DiscoveredTopics, Remedy, TiltKind
 from recordings.errors import LogError
 from recordings.inertial.imu_content import imu_content
@@ -129,6 +129,8 @@ class SourceResolution:
         notes = []
         if "right" in self.topics and self.baseline_note is not None:
             notes.append(("right", self.baseline_note.sentence))
+        if self.source.odometry == VISUAL:
+            notes.append(("odometry", self.unavailable["odometry"]))
         if self.tilt is not None:
             notes.append(("inclinometer", self.tilt.note(estimator, self.source)))
         if self.mount is not None and self.mount.base_from_camera is None:

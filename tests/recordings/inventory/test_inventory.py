@@ -13,7 +13,7 @@ from flow.contracts import Severity
 from recordings import McapSource
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
-from recordings.inventory.description import Damage
+from recordings.inventory.description import Damage, describe
 from recordings.inventory.text import format_description
 from recordings.mcap.chunk import HEAD_BYTES
 from recordings.mcap.file import McapFile
@@ -79,6 +79,16 @@ def test_the_text_lists_topics_streams_and_missing_streams(tmp_path):
     assert "missing: odometry: the log has no nav_msgs/Odometry" in text
     frames = "frames: 5 stereo pairs (stamps within 5 ms) from 5 left images and 5 right images"
     assert f"{frames}; 5 left images with a tilt (readings at most 200 ms apart)" in text
+
+
+def test_an_odometry_that_the_user_does_without_is_not_missing(sample):
+    with McapSource(odometry="visual").open(sample) as log:
+        described = describe(log)
+        assert "odometry" in log.missing
+    assert described["missing"] == {}
+    why = "the source's 'odometry' is set to visual"
+    lines = [line for line in format_description(described).splitlines() if why in line]
+    assert lines == [f"note: odometry: {why}"]
 
 
 def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path):
