@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from flow.contracts import Finding, Severity
 from recordings.errors import LogError
 from recordings.ros2.from_msg import camera_model, frame_of, stamp_or
 from recordings.source.calibration import Camera
 from recordings.source.topics import DecodedTopics
+from recordings.source.transforms import TransformTree
 from recordings.video.decoder import PixelReader, VideoDecoder
 from stages.data import Array, CameraImage, CameraModel
 
@@ -101,6 +103,27 @@ def first_calibrations(
         else:
             infos[side] = CalibrationTopic(topic, info[0], info[1] or messages.frame_of(chosen[side]))
     return infos, unread
+
+
+def in_known_frames(
+    infos: Mapping[str, CalibrationTopic], images: Mapping[str, str], tree: TransformTree
+) -> tuple[dict[str, CalibrationTopic], list[tuple[str, Finding]]]:
+    """The calibrations with the frames of their images where the tree has only these; and (side, finding) pairs.
+
+    images: side -> frame of its images. A CameraInfo and its images should have one frame. Where they differ and the
+    tree has both, that of the CameraInfo is used. By convention that of a right CameraInfo may be the left camera's.
+    """
+    known, found = dict(infos), list[tuple[str, Finding]]()
+    for side, info in infos.items():
+        own, other = info.frame_id, images[side]
+        differ = f"the frame_id of {info.topic} is '{own}', that of its images is '{other}'"
+        if other in tree.edges and own not in tree.edges:
+            known[side] = replace(info, frame_id=other)
+            found.append((side, Finding(f"{differ}, which is used, because no static transform has '{own}'")))
+        elif side == "left" and other in tree.edges and not tree.coincide(own, other):
+            used = f"{differ}; the transforms of '{own}' are used; record one frame in both"
+            found.append((side, Finding(used, Severity.WARNING)))
+    return known, found
 
 
 def mismatched_images(

@@ -255,13 +255,15 @@ class McapLog:
     def faults(self) -> dict[str, Finding]:
         """Stream -> what is wrong with it, by what the log states or by what a run has shown."""
         found = dict[str, Finding]()
-        note = self.resolution.baseline_note if "right" in self.topics else None
-        if note is not None and note.severity is Severity.WARNING:
-            found["right"] = Finding(self.notes()["right"], Severity.WARNING)
+        notes = self.notes()
+        for severity in (Severity.WARNING, Severity.FAULT):
+            for side, each in self.resolution.findings:
+                if each.severity is severity and side in self.topics:
+                    found[side] = replace(each, sentence=notes[side])
         if self._estimator and self.resolution.tilt and (fault := self.resolution.tilt.fault(self._estimator)):
             found["inclinometer"] = fault
         if self._moving and (gaps := self._moving.gaps(self.first_stamp)):
-            found["mount"] = Finding(f"{self.notes()['mount']}; {gaps}", Severity.WARNING)
+            found["mount"] = Finding(f"{notes['mount']}; {gaps}", Severity.WARNING)
         return found
 
     def stamp_of(self, raw: RawMessage, stream: str) -> int:

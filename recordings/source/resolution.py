@@ -17,7 +17,7 @@ from recordings.inertial.imu_content import imu_content
 from recordings.inertial.up_estimator import UpEstimator
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_note, calibrated_pair
-from recordings.source.cameras import CAMERAS, first_calibrations, mismatched_images
+from recordings.source.cameras import CAMERAS, first_calibrations, in_known_frames, mismatched_images
 from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
 from recordings.source.moving_mount import MovingMount, moving_mount, other_joints
@@ -37,9 +37,10 @@ class SourceResolution:
     messages: decoded by topic; topics: stream -> topic; chosen: role -> topic; why: stream -> why its topic;
     unavailable: stream -> reason and remedy; remedies: stream -> settings, any of which would supply it; refused:
     setting of the source that contradicts the log -> reason; undecodable: a sentence; static: the tf tree; infos: side
-    -> its first calibration; cameras: the calibrated pair, if complete; tilt: how it is read, if there is an
-    inclinometer; tilt_frame: of the first inclinometer message; mount: of the camera on the rover, the first one if it
-    moves; moving: its mount at any time, if it moves; problems: (stream, error) pairs for the ledger.
+    -> its first calibration; cameras: the calibrated pair, if complete; findings: (side, finding) pairs about it; tilt:
+    how it is read, if there is an inclinometer; tilt_frame: of the first inclinometer message; mount: of the camera on
+    the rover, the first one if it moves; moving: its mount at any time, if it moves; problems: (stream, error) pairs
+    for the ledger.
     """
 
     def __init__(self, file: Recording, source: LogSettings) -> None:
@@ -127,8 +128,7 @@ class SourceResolution:
     def notes(self, estimator: UpEstimator | None) -> list[tuple[str, str]]:
         """(Stream, note, which may be empty) on baseline, tilt and mount; estimator: of the direction of up, if any."""
         notes = []
-        if "right" in self.topics and self.baseline_note is not None:
-            notes.append(("right", self.baseline_note.sentence))
+        notes += [(side, finding.sentence) for side, finding in self.findings if side in self.topics]
         if self.source.odometry == VISUAL:
             notes.append(("odometry", self.unavailable["odometry"]))
         if self.tilt is not None:
@@ -152,7 +152,10 @@ class SourceResolution:
         self.infos, unread = (of_files, {}) if files else first_calibrations(self.messages, self.chosen)
         self.unavailable |= unread
         self.cameras: tuple[Camera, Camera] | None = None
-        self.baseline_note: Finding | None = None
+        self.findings = list[tuple[str, Finding]]()
+        if not files:
+            images = {side: self.messages.frame_of(self.chosen[side]) for side in self.infos}
+            self.infos, self.findings = in_known_frames(self.infos, images, self.static)
         if len(self.infos) < len(CAMERAS):
             return
         left, right = (self.infos[side] for side in CAMERAS)
@@ -162,7 +165,9 @@ class SourceResolution:
             self.unavailable |= dict.fromkeys(CAMERAS, str(pair))
             return
         of_file = Finding(f"the calibration is that of {left.topic}")
-        self.cameras, self.baseline_note = pair, of_file if files else baseline_note(pair, models, names, self.static)
+        note = of_file if files else baseline_note(pair, models, names, self.static)
+        self.cameras = pair
+        self.findings += [("right", note)] if note is not None else []
 
     def _resolve_tilt(self, kind: TiltKind) -> None:
         """How the tilt is read."""

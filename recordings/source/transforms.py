@@ -83,6 +83,13 @@ class TransformTree:
             whole = whole.after(self.edges[above][below])
         return whole
 
+    def coincide(self, one: str, other: str) -> bool:
+        """Whether two frames are one, or at one place with the same axes."""
+        between = self.between(one, other)
+        return one == other or (
+            between is not None and are_same(between, Transform(one, other, np.eye(3), np.zeros(3)))
+        )
+
     def path(self, parent: str, child: str) -> list[str]:
         """The frames of the shortest path from `parent` to `child`; empty if nothing connects them."""
         if not parent or not child:

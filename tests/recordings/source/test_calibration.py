@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import Finding, Severity
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.ros2.to_msg import transform_message
@@ -15,11 +16,16 @@ from recordings.source.calibration import calibrated_pair
 from recordings.source.transforms import BODY_FROM_OPTICAL, TransformTree
 from stages.data import CameraModel, Transform
 from tests.recordings.sample_log import (
+    BASELINE,
     FRAMES,
+    INFOS,
+    LEFT,
     START,
     TRANSFORMS,
     changed,
     dropped,
+    essences,
+    items_of,
     losses_in,
     missing_in,
     model,
@@ -202,6 +208,39 @@ def test_frames_without_names_are_not_connected(tmp_path):
     with McapSource().open(write_sample(tmp_path / "log.mcap", *edits)) as log:
         assert log.resolution.mount is None
         assert "joins the camera (whose frame_id is empty) and the inclinometer (whose frame_id" in log.missing["mount"]
+
+
+NAMED = f"the frame_id of {INFOS[0]} is '{{}}', that of its images is '{{}}'"
+
+
+@pytest.mark.parametrize("by_images", [True, False])
+def test_of_two_frames_of_a_camera_the_one_in_the_tree_is_used(sample, tmp_path, by_images):
+    info, images = ("unlinked", "left_optical") if by_images else ("left_optical", "unlinked")
+    frames = [changed(INFOS[0], {"header.frame_id": info}), changed(LEFT, {"header.frame_id": images})]
+    path = write_sample(tmp_path / "log.mcap", *frames)
+    assert essences(items_of(path)) == essences(items_of(sample))
+    used = "which is used, because no static transform has 'unlinked'"
+    with McapSource().open(path) as log:
+        assert log.notes() == ({"left": f"{NAMED.format(info, images)}, {used}"} if by_images else {})
+
+
+@pytest.mark.parametrize("turn", [0, 90])
+def test_two_frames_of_a_camera_at_different_places_are_a_warning(sample, tmp_path, turn):
+    body = Transform("left_optical", "left_body", Rotation.from_euler("x", turn, degrees=True).as_matrix(), np.zeros(3))
+    edits = mounted(*TRANSFORMS, body), changed(LEFT, {"header.frame_id": "left_body"})
+    path = write_sample(tmp_path / "log.mcap", *edits)
+    assert essences(items_of(path)) == essences(items_of(sample))
+    used = "the transforms of 'left_optical' are used; record one frame in both"
+    finding = Finding(f"{NAMED.format('left_optical', 'left_body')}; {used}", Severity.WARNING)
+    with McapSource().open(path) as log:
+        assert log.faults() == ({"left": finding} if turn else {})
+
+
+def test_a_right_calibration_in_the_left_frame_is_no_conflict(tmp_path):
+    right = Transform("left_optical", "right_optical", np.eye(3), [BASELINE, 0, 0])
+    edits = mounted(*TRANSFORMS, right), changed(INFOS[1], {"header.frame_id": "left_optical"})
+    with McapSource().open(write_sample(tmp_path / "log.mcap", *edits)) as log:
+        assert (log.missing, log.notes(), log.faults()) == ({}, {}, {})
 
 
 def test_a_calibration_without_a_frame_has_that_of_its_images(tmp_path):
