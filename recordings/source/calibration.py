@@ -22,6 +22,8 @@ from stages.data.rotations import angle_of
 
 MAX_PARALLEL_RAD = 1e-3  # parallel cameras are turned against each other by less: 1 pixel at 1000 px
 MAX_OFFSET_SHARE = 0.01  # of the baseline; parallel cameras are displaced against each other in y and z by less
+MIN_BASELINE, MAX_BASELINE = 1 / 500, 10.0  # of the camera's height; beyond, it is in another unit or misplaced
+ASSUMED_HEIGHT = 1.0  # m, of a camera whose height is unknown
 BASELINE_RTOL = 0.05  # two baselines that differ by less agree
 MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e6
 MIN_RECTIFIED_SCALE = 0.1  # of the focal length; a smaller rectified image means that D is wrong
@@ -127,6 +129,26 @@ def baseline_note(
         f"the baseline is {baseline:.4g} m by P of the CameraInfo, which is used, but {distance:.4g} m by {transform}; "
         "correct the wrong one",
         Severity.WARNING,
+    )
+
+
+def baseline_fault(baseline: float, height: float) -> Finding | None:
+    """A fault if a baseline, m, is out of proportion to the camera's height, m, above the rover's base frame.
+
+    A height of 0 or less is that of no ground.
+
+    >>> baseline_fault(0.24, 0.9) is baseline_fault(0.24, 0.0) is baseline_fault(0.0008, 0.02) is None
+    True
+    """
+    low = height if height > 0 else ASSUMED_HEIGHT
+    if MIN_BASELINE * low <= baseline <= MAX_BASELINE * max(low, ASSUMED_HEIGHT):
+        return None
+    return Finding(
+        f"the baseline of {baseline:.3g} m is out of proportion to the camera's height of {low:.3g} m"
+        f"{'' if height > 0 else ', as assumed'}, so all lengths are wrong; correct the calibration (P[0,3] is the "
+        "focal length in px times metres), or record the camera's height in /tf_static",
+        Severity.FAULT,
+        about="cameras",
     )
 
 

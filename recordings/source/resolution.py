@@ -16,7 +16,7 @@ from recordings.errors import LogError
 from recordings.inertial.imu_content import imu_content
 from recordings.inertial.up_estimator import UpEstimator
 from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
-from recordings.source.calibration import Camera, baseline_note, calibrated_pair
+from recordings.source.calibration import Camera, baseline_fault, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, in_known_frames, mismatched_images
 from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
@@ -25,7 +25,7 @@ from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
 from recordings.source.topics import DecodedTopics, attempt
 from recordings.source.transforms import TransformTree, are_same
-from stages.data import LEVEL_FRAME, Mount, Pose
+from stages.data import LEVEL_FRAME, Mount, Pose, StereoCamera
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
 _MAX_LISTED = 5  # topics in a sentence
@@ -55,6 +55,7 @@ class SourceResolution:
         self._resolve_tilt(found.tilt)
         self._resolve_mount()
         self._check_base_frame()
+        self._check_baseline()
         self._resolve_pose()
         if all(side in self.infos and side not in self.unavailable for side in CAMERAS):
             self.unavailable |= mismatched_images(self.messages, self.chosen, self.infos)
@@ -237,6 +238,15 @@ class SourceResolution:
                 f"the source's 'base_frame' is set to '{base}', but /tf_static joins the camera to {others} only; set "
                 "it to one of these, or record its transform to the camera"
             )
+
+    def _check_baseline(self) -> None:
+        """Note a baseline that cannot be right for the camera's height."""
+        if self.cameras is None:
+            return
+        (left, right), base = self.cameras, self.mount.base_from_camera if self.mount is not None else None
+        baseline = StereoCamera.from_models(left.model, right.model, left.image_frame, left.rectified).baseline
+        fault = baseline_fault(baseline, 0.0 if base is None else float(base.translation[2]))
+        self.findings += [("right", fault)] if fault is not None else []
 
     def _frames_of_camera(self) -> str:
         """The frames that /tf_static joins to the camera, without those of the sensors."""

@@ -243,6 +243,24 @@ def test_a_right_calibration_in_the_left_frame_is_no_conflict(tmp_path):
         assert (log.missing, log.notes(), log.faults()) == ({}, {}, {})
 
 
+@pytest.mark.parametrize(("baseline", "base", "sound"), [
+    (BASELINE, True, True), (BASELINE / 1000, True, False), (BASELINE * 1000, True, False), (0.0017, True, False),
+    (0.0019, True, True), (BASELINE / 1000, False, False), (BASELINE, False, True),
+])  # fmt: skip
+def test_a_baseline_out_of_proportion_to_the_height_is_a_fault(tmp_path, baseline, base, sound):
+    by_p = changed("right/camera_info", {"p": lambda p: np.where(np.arange(12) == 3, -20 * baseline, p)})
+    unmounted = mounted(Transform("left_optical", "imu_link", np.eye(3), np.zeros(3)))
+    path = write_sample(tmp_path / "log.mcap", by_p, *([] if base else [unmounted]))
+    with McapSource().open(path) as log:
+        found = log.faults().get("right")
+        noted = log.notes().get("right", "")
+    assert (found is None, noted == "") == (sound, sound)
+    if found is not None:
+        assert (found.severity, found.about, found.sentence) == (Severity.FAULT, "cameras", noted)
+        height = "0.9 m, so" if base else "1 m, as assumed, so"
+        assert f"the baseline of {baseline:.3g} m is out of proportion to the camera's height of {height} all " in noted
+
+
 def test_a_calibration_without_a_frame_has_that_of_its_images(tmp_path):
     edit = changed("camera_info", {"header.frame_id": ""})
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
