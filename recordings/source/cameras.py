@@ -52,8 +52,8 @@ class CalibrationHistory:
         place = bisect_right(self.stamps, stamp) - 1
         if place >= 0 and not self.same[place]:
             raise LogError(
-                "the calibration differs from the log's first one, so the image cannot be used; split the log "
-                f"where it changes ({self._since(place)})"
+                "the calibration differs from the log's first one, so the image cannot be used; record two cameras on "
+                f"two topics, or split the log where it changes ({self._since(place)})"
             )
 
     def _since(self, place: int) -> str:
