@@ -241,6 +241,13 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, sai
         assert why_not in refused("why", fast_result, *late[:2], cell, *late[3:])
 
 
+@pytest.mark.parametrize("stream", ["pose", "health/frames"])
+def test_a_stream_that_is_no_navigation_map_is_named_as_such(traverse, tmp_path, refused, stream):
+    out, also = tmp_path / "out.mcap", ("--set", "McapSink.also=[health]")
+    assert roverflow("run", traverse, *SMALL, *also, "--end", 0.8, "--no-rrd", "-o", out) == 0
+    assert f"no navigation map '{stream}'" in refused("why", out, "--at", 0.5, "--pixel=9,9", "--map", stream)
+
+
 @pytest.mark.parametrize(("given", "why_not"), [
     (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2"),
     (("--set", "McapSink.results=[points]"), "contains no /nav/regional_navigation_map, only /nav/diag"),

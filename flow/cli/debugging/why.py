@@ -61,12 +61,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _is_regional(result: Path, stream: str) -> bool:
-    """Whether a navigation map of a result log is in another frame than `level`."""
+    """Whether a stream of a result log is a navigation map in another frame than `level`."""
     from recordings.mcap.file import iter_decoded
     from stages.data import LEVEL_FRAME
 
     first = next(iter_decoded(result, [f"/nav/{stream}"], Counter()), None)
-    return first is not None and first[2].header.frame_id != LEVEL_FRAME
+    return first is not None and hasattr(first[2], "info") and first[2].header.frame_id != LEVEL_FRAME
 
 
 def _regional(options: argparse.Namespace) -> int:
