@@ -43,12 +43,13 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     path : Path
         A log that `roverflow run` wrote.
     streams : collection of str, optional
-        Names such as "elevation_map" or "pose"; all by default.
+        Names such as "elevation_map" or "pose", or one name; all by default.
 
     Yields
     ------
     ResultFrame
-        A log keeps no confidence, so that of disparities is NaN. Regional maps come once a step of the rover.
+        A log keeps no confidence, sigma and camera of disparities: NaN, None and None. Regional maps come once a step
+        of the rover.
 
     Raises
     ------
@@ -61,7 +62,7 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     >>> for frame in read_result("out.mcap", ["navigation_map"]):  # doctest: +SKIP
     ...     print(frame.stamp, (frame.items["navigation_map"].cells == 100).sum())
     """
-    path = Path(path)
+    path, streams = Path(path), [streams] if isinstance(streams, str) else streams
     check_profile(path, facts_of(path, "a log that roverflow run wrote"))
     with McapFile(path) as log:
         schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}

@@ -27,7 +27,12 @@ def test_disparities_have_their_origins_and_maps_their_reasons(result):
     np.testing.assert_array_equal(np.isfinite(disparity.pixels), known(disparity.source))
     assert (disparity.source == PixelOrigin.OUT_OF_VIEW).any()
     assert np.isnan(disparity.confidence).all()
+    assert disparity.sigma is disparity.camera is None
     assert len(np.unique(navigation.reason)) > 3
+
+
+def test_one_stream_may_be_given_by_its_name_alone(result):
+    assert all(set(frame.items) == {"pose"} for frame in read_result(result, "pose"))
 
 
 def test_other_logs_and_unknown_streams_are_refused(result, traverse):
