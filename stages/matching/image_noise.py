@@ -49,6 +49,7 @@ class MeasureNoise(Stage):
     """
 
     def __call__(self, frame: StereoFrame) -> ImageNoise:
+        """The noise of `frame.left`."""
         return ImageNoise(frame.stamp, frame.once(frame_noise))
 
 

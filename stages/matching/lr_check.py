@@ -27,6 +27,7 @@ class LeftRightCheck(Stage):
     disparities: int = parameter(0, "search range of `backward`; 0: that of `disparity`", unit="px", low=0)
 
     def __call__(self, disparity: Disparity, backward: Disparity) -> Disparity:
+        """The left disparity without the pixels that `backward` contradicts; their source is LEFT_RIGHT."""
         if disparity.pixels.shape != backward.pixels.shape:
             raise StageError(
                 f"LeftRightCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "

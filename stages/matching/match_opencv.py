@@ -78,6 +78,7 @@ class MatchOpenCV(Stage):
             raise ValueError("MatchOpenCV: block costs could exceed 16 bits; use a smaller block, p2 or prefilter")
 
     def __call__(self, frame: StereoFrame) -> Disparity:
+        """The left disparity of the rectified `frame`."""
         check_rectified(self, frame)
         left, right = eight_bit(frame.left, frame.right)
         pixels, source = self._matched(*alike(left, right)) if self.color else self._matched(gray(left), gray(right))

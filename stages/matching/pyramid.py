@@ -22,6 +22,7 @@ class Halve(Stage):
     """The frame at half size, each pixel the mean of four; an odd last row or column is repeated."""
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
+        """The smaller frame, with a camera of its size."""
         check_rectified(self, frame)
         full_height, full_width = frame.left.shape[:2]
         left, right = halved(frame.left), halved(frame.right)
@@ -50,6 +51,7 @@ class Upsample(Stage):
     keep_sigma: bool = parameter(False, "double the sigma as well; a prior needs none")
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
+        """The disparity of `frame`, from that of `Halve()(frame)`."""
         height, width = frame.left.shape[:2]
         small = disparity.pixels.shape
         if small != ((height + 1) // 2, (width + 1) // 2):
@@ -76,6 +78,7 @@ class SwapViews(Stage):
     """
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
+        """The swapped frame."""
         check_rectified(self, frame)
         camera = frame.camera
         last = camera.width - 1

@@ -82,6 +82,7 @@ class Rectify(Stage):
             )
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
+        """The rectified frame; its `camera` has no `raw`."""
         if self._terms is not None and not self._may_move(frame.camera):
             return _rectified(frame, self._terms, self.columns or 0)
         plain = _rectified(frame)
