@@ -65,17 +65,24 @@ def check_cells(what: str, width: float, resolution: float, times: int = 1) -> N
         )
 
 
+def check_type(stage: Stage, port: str, item: Any, kind: type) -> None:
+    """Raise StageError for an input of another type, such as a bare array."""
+    if not isinstance(item, kind):
+        name = type(stage).__name__
+        raise StageError(f"{name}: the {port} must be a stages.{kind.__name__}, not a {type(item).__name__}")
+
+
 def check_rectified(stage: Stage, frame: StereoFrame) -> None:
     """Raise StageError for a frame that is not rectified, or is none, as a single image."""
-    name = type(stage).__name__
-    if not isinstance(frame, StereoFrame):
-        raise StageError(f"{name}: the frame must be a stages.StereoFrame, not a {type(frame).__name__}")
+    check_type(stage, "frame", frame, StereoFrame)
     if frame.camera.raw is not None:
+        name = type(stage).__name__
         raise StageError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
 
 
 def check_level(stage: Stage, cloud: PointCloud) -> None:
     """Raise StageError for a cloud that is not in frame `level`."""
+    check_type(stage, "cloud", cloud, PointCloud)
     if cloud.frame_id != LEVEL_FRAME:
         name = type(stage).__name__
         raise StageError(
@@ -86,6 +93,7 @@ def check_level(stage: Stage, cloud: PointCloud) -> None:
 def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None:
     """Raise StageError for a frame that is not rectified, or a disparity of another size."""
     check_rectified(stage, frame)
+    check_type(stage, "disparity", disparity, Disparity)
     if disparity.pixels.shape != frame.left.shape[:2]:
         raise StageError(
             f"{type(stage).__name__}: the disparity is {disparity.pixels.shape}, the left image "

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -129,6 +130,9 @@ class StereoCamera:
     def __post_init__(self) -> None:
         if self.cx_right is None:
             object.__setattr__(self, "cx_right", self.cx)
+        for name in ("fx", "fy", "cx", "cy", "cx_right", "baseline", "width", "height"):
+            if not isinstance(getattr(self, name), Real):
+                raise StageError(f"StereoCamera.{name} must be a number, not {getattr(self, name)!r}")
         for name in ("fx", "fy", "baseline", "width", "height"):
             if not getattr(self, name) > 0:
                 raise StageError(f"StereoCamera.{name} must be positive, not {getattr(self, name)}")
@@ -231,6 +235,8 @@ class StereoFrame:
         publish_stamp(self)
         publish_image(self, "left")
         publish_image(self, "right")
+        if not isinstance(self.camera, StereoCamera):
+            raise StageError(f"StereoFrame.camera must be a stages.StereoCamera, not a {type(self.camera).__name__}")
         if self.left.shape[:2] != self.right.shape[:2]:
             raise StageError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
         if self.left.dtype != self.right.dtype:

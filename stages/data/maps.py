@@ -88,6 +88,8 @@ class ElevationMap:
         layers = {name: np.asarray(layer) for name, layer in self.layers.items()}
         if "elevation" not in layers:
             raise StageError("ElevationMap has no layer 'elevation'")
+        if layers["elevation"].ndim != 2:
+            raise StageError(f"ElevationMap layer 'elevation' must be (rows, cols), not {layers['elevation'].shape}")
         rows, cols = layers["elevation"].shape
         for name, layer in layers.items():
             if layer.shape != (rows, cols) or layer.dtype != np.float32:

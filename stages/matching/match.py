@@ -27,7 +27,7 @@ from stages.matching.kernels.semiglobal import Matches, match
 from stages.matching.kernels.sgm_local import SearchWindows, windows_around
 from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.texture import information, match_variance, noise_ratio, slopes
-from stages.stage import Stage, check_rectified, parameter
+from stages.stage import Stage, check_rectified, check_type, parameter
 
 F32 = np.float32
 MIN_SIDE = 16  # px, of an image
@@ -150,6 +150,7 @@ class Match(Stage):
             raise ValueError("Match.follow_slopes needs a `prior`: connect one, or set it to false")
 
     def __call__(self, frame: StereoFrame, prior: Disparity | None = None) -> Disparity:
+        """The left disparity of the rectified `frame`."""
         self._check(frame, prior)
         if prior is None or not self.max_prior_step:
             return self._matched(frame, prior)
@@ -188,9 +189,10 @@ class Match(Stage):
                 f"Match.min_disparity = {self.min_disparity} px leaves nothing to compare in images {width} px wide"
             )
         self.check_inputs({"frame"} if prior is None else {"frame", "prior"})
-        if prior is not None and not isinstance(prior, Disparity):
-            raise StageError(f"Match: the prior must be a stages.Disparity, not a {type(prior).__name__}")
-        if prior is not None and prior.pixels.shape != (height, width):
+        if prior is None:
+            return
+        check_type(self, "prior", prior, Disparity)
+        if prior.pixels.shape != (height, width):
             raise StageError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; "
                 "enlarge a coarser prior by stages.Upsample"

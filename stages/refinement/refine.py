@@ -127,6 +127,7 @@ class Refine(Stage):
     )
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
+        """Refine `disparity`, the left disparity of the rectified `frame`."""
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         rows = rows_without_sigma(disparity)

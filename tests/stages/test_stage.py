@@ -52,6 +52,13 @@ TIMES = "frame of 7 ns, disparity of 8 ns: join data"
       for stage in (stages.Voxelise(), stages.VoxelGrid())),
     (stages.Match(), (IMAGE, IMAGE), f"Match: {NO_FRAME} ndarray"),
     (stages.Refine(), (disparity(), FRAME), f"Refine: {NO_FRAME} Disparity"),
+    (stages.Refine(), (FRAME, IMAGE), r"Refine: the disparity must be a stages\.Disparity, not a ndarray"),
+    (stages.Match(), (FRAME, IMAGE), r"Match: the prior must be a stages\.Disparity, not a ndarray"),
+    (stages.Voxelise(), (IMAGE,), r"Voxelise: the cloud must be a stages\.PointCloud, not a ndarray"),
+    (stages.Level(), (cloud_of(np.ones((1, 3)), frame_id="cam"), [0, -1, 0]), "Level: the tilt must be a stages"),
+    (stages.Level(), (disparity(), None), "Level: the cloud must be a stages"),
+    *((stage, (IMAGE,), rf"{type(stage).__name__}: the elevation must be a stages\.ElevationMap, not a ndarray")
+      for stage in (stages.TerrainFeatures(), stages.Binarise())),
     *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_FRAME_AND_DISPARITY[:2]),
     (Running(stages.VisualOdometry()), (FRAME, disparity(30)), JOIN),
     (stages.Upsample(), (FRAME, disparity(40, 66)), r"Upsample: .*\(40, 66\)"),
