@@ -6,6 +6,7 @@ import runpy
 import subprocess
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 from flow.contracts import Severity, StageError
 from recordings.simulator import Simulation
-from stages import Disparity, ElevationMap, NavigationMap, PixelOrigin, known
+from stages import Disparity, ElevationMap, NavigationMap, PixelOrigin, StereoFrame, known
 from tests.docs import pages
 
 
@@ -102,6 +103,22 @@ def test_flow_runs_without_a_rover(tmp_path):
     assert done.stdout == "COMPLETE 3\n"
     shown = next(block.text for block in pages.blocks("text") if block.page == "docs/flow-without-a-rover.md")
     assert (tmp_path / "numbers.txt").read_text() == shown
+
+
+def test_a_template_runs_on_frames_in_memory(tmp_path, monkeypatch):
+    save("docs/pipelines.md", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    simulation = Simulation(width=320, height=240, relief_cells=512)
+    camera, rendered = simulation.camera, simulation.frame(0)
+    truth = camera.fx * camera.baseline / rendered.depth
+    code = next(block.text for block in pages.blocks("python") if "from in_memory import Frames" in block.text)
+    names: dict[str, Any] = {"frame": StereoFrame(7, *rendered.images, camera)}
+    exec(code, names)
+    (kept,) = names["kept"]
+    assert (names["summary"]["verdict"], kept.stamp) == ("COMPLETE", 7)
+    measured = kept.source == PixelOrigin.MEASURED
+    assert np.median(np.abs(kept.pixels - truth)[measured] / kept.sigma[measured]) < 1
 
 
 def test_the_stage_with_state_starts_each_run_empty(written):
