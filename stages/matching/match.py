@@ -51,8 +51,8 @@ class Match(Stage):
     """Disparities of a rectified frame by semi-global matching; `source` says why a pixel has none.
 
     `prior`, an earlier or coarser result of the same size, attracts the search; it is no evidence. The confidence is
-    the probability that the disparity is right within 1 px, for the default penalties and 8 paths. See
-    docs/matching.md.
+    the probability that the disparity is right within 1 px, for the default penalties and 8 paths. 16-bit images are
+    stretched to 8 bits, from the 0.1th to the 99.9th percentile of both. See docs/matching.md.
 
     References
     ----------
