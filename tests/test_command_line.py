@@ -370,6 +370,7 @@ def test_stages_lists_every_stage_and_describes_one_or_a_data_type(said, refused
         "Clean": "max_range = 8 m  (float, 10 cm to 200 m)\n      horizontal range wanted in the map",
         "Match": "max_depth = 0  (float, m, at least 0)\n",
         "Disparity": "fields:\n  stamp: Nanoseconds.\n  pixels: (H, W) float32, px, NaN = unknown.\n",
+        "PointCloud": "\n  points: (N, 3) float32. Metres, in `frame_id`.\n",
         "tests.slow.Nap": "tests.slow.Nap (stage): Passes frames on after a second.\ninputs:\n  frame: StereoFrame\n",
     }.items():
         assert shown in said(0, "stages", name).out

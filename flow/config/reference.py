@@ -128,10 +128,11 @@ def _contents(kind: type, doc: str) -> dict[str, str]:
 
 
 def _documented_fields(doc: str) -> dict[str, str]:
-    """Field -> content, from the section Parameters of a numpydoc docstring."""
+    """Field -> type, if the docstring states it, and content, from the section Parameters of a numpydoc docstring."""
     section = re.search(r"(?:Parameters|Attributes)\n-+\n(.*?)(?=\n\n\w+\n-+\n|\Z)", doc, re.S)
     rows = re.findall(r"^(\S.*)\n((?:[ ]+.*\n?)+)", section[1], re.M) if section else []
-    return {name.partition(" : ")[0]: " ".join(text.split()) for name, text in rows}
+    named = ((*name.partition(" : "), " ".join(text.split())) for name, text in rows)
+    return {name: f"{kind}. {text}" if kind else text for name, _, kind, text in named}
 
 
 def _parameters(kind: type, prefix: str = "") -> Iterator[ParameterReference]:
