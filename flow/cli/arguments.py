@@ -53,9 +53,11 @@ def memory(text: str) -> str:
 
 
 def seconds(text: str) -> float:
-    """Seconds after a log's first message."""
+    """Seconds after a log's first message; the text may also have another unit, such as 2min."""
+    from flow.units import quantity
+
     try:
-        value = float(text)
+        value = quantity(text if text[-1:].isalpha() else f"{text} s", "s")
     except ValueError:
         value = math.nan
     if not 0 <= value <= _MAX_SECONDS:
@@ -72,6 +74,8 @@ def instant(text: str) -> At:
     --------
     >>> instant("12.3")
     12.3
+    >>> instant("2min")
+    120.0
     >>> instant("2023-11-15 22:13:20.513 000 000Z") == instant("1700086400513000000")
     np.True_
     """

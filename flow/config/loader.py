@@ -194,7 +194,8 @@ def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -
             _check_known(inputs[key], known, value.place)
         elif key not in parameters:
             valid = [*ports, *parameters, "use", "optional"]
-            raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{nearest_or_all(key, valid)}")
+            meant = nearest(key, [*valid, *entry.inner_parameters()]) or nearest_or_all(key, valid)
+            raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{meant}")
     for port in ports:
         if port not in inputs and port not in unneeded:
             raise entry.place.error(f"'{name}' lacks its input '{port}' ({entry.use} needs it)")

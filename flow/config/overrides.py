@@ -56,7 +56,7 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
         elif change.target in settings:
             settings[change.target] = _with_value(settings[change.target], change.target, change.keys, change.value)
         else:
-            raise change.value.place.error(_unknown(change, {*streams, *parts}, settings))
+            raise change.value.place.error(_unknown(change, streams, parts, settings))
     filled = {
         key: item if key in ("templates", "settings") else filled_in(item, settings) for key, item in tree.value.items()
     }
@@ -94,11 +94,14 @@ def filled_in(item: Value, values: Mapping[str, Value]) -> Value:
     return replace(values[name], filled_at=item.place)
 
 
-def _unknown(change: Change, entries: Iterable[str], settings: Mapping[str, Value]) -> str:
+def _unknown(change: Change, streams: Mapping[str, Value], parts: Iterable[str], settings: Mapping[str, Value]) -> str:
     """The sentence about a change whose target is neither an entry nor a setting."""
-    target, keys = change.target, change.keys
+    target, keys, entries = change.target, change.keys, [*streams, *parts]
     if keys and target == "settings":
         return f"a setting has no prefix; write {keys[0]}=value"
+    of_class = [name for name, item in streams.items() if _class_name(item).lower() == target.lower()]
+    if keys and of_class:
+        return f"write the stream in place of its class '{target}': {' or '.join(of_class)}"
     if keys:
         return f"there is no stream '{target}'{nearest(target, [*entries, *settings])}"
     if target in entries:
@@ -113,7 +116,7 @@ def _part(tree: Value, key: str, kind: type) -> Any:
 
 
 def _class_name(item: Value) -> str:
-    """The class of a sink without its module, by which `--set` names it."""
+    """The class of a stream or a sink without its module; `--set` names a sink by it."""
     use = item.value.get("use") if isinstance(item.value, dict) else None
     return str(use.value).rpartition(".")[2] if use is not None else ""
 
