@@ -14,6 +14,7 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
+from recordings.ros2.plain import array_of
 from recordings.scoring.result_log import check_profile, facts_of
 from stages.data import Disparity
 
@@ -27,8 +28,8 @@ class ResultFrame:
     stamp : int
         Nanoseconds.
     items : dict
-        Stream -> `Disparity`, `ElevationMap`, `NavigationMap`, `Pose`, number or text; of a cloud its fields, name ->
-        (N,) array.
+        Stream -> `Disparity`, `ElevationMap`, `NavigationMap`, `Pose`, number, text or array (of an image, its
+        pixels); of a cloud its fields, name -> (N,) array.
     """
 
     stamp: int
@@ -66,18 +67,19 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     check_profile(path, facts_of(path, "a log that roverflow run wrote"))
     with McapFile(path) as log:
         schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}
+    parts = {topic: f"{topic}/{_JOINED[schema][0]}" for topic, schema in schemas.items() if schema in _JOINED}
     known = {
         topic.removeprefix("/nav/"): topic
         for topic, schema in sorted(schemas.items())
-        if topic.startswith("/nav/") and schema in (*_JOINED, *_READERS) and not topic.endswith("/reason")
+        if topic.startswith("/nav/") and schema in (*_JOINED, *_READERS) and topic not in parts.values()
     }
     for name in sorted(set(streams) - known.keys()):
         if other := schemas.get(f"/nav/{name}"):
             raise LogError(f"{path}: stream '{name}' is {other}, which read_result does not read; it reads {_READABLE}")
         raise LogError(f"{path} has no stream '{name}', only {', '.join(known)}")
     chosen = {known[name] for name in streams or known}
-    parts = {f"{topic}/{part}" for topic in chosen for part, _ in _JOINED.values()} & schemas.keys()
-    for stamp, group in groupby(iter_decoded(path, sorted(chosen | parts)), key=lambda item: item[1]):
+    read = chosen | {parts[topic] for topic in chosen & parts.keys()} & schemas.keys()
+    for stamp, group in groupby(iter_decoded(path, sorted(read)), key=lambda item: item[1]):
         messages = {topic: message for topic, _, message in group}
         yield ResultFrame(stamp, dict(_items(messages, chosen, schemas)))
 
@@ -111,6 +113,9 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "grid_map_msgs/msg/GridMap": ros2.read_grid_map,
     "nav_msgs/msg/Odometry": lambda message: ros2.pose_of(message, 0, "base_link"),
     "sensor_msgs/msg/PointCloud2": ros2.read_point_cloud,
+    **dict.fromkeys(
+        ("sensor_msgs/msg/Image", "std_msgs/msg/Float64MultiArray", "std_msgs/msg/Int64MultiArray"), array_of
+    ),
     **dict.fromkeys(
         ("std_msgs/msg/Float64", "std_msgs/msg/Int64", "std_msgs/msg/Bool", "std_msgs/msg/String"), attrgetter("data")
     ),

@@ -46,6 +46,15 @@ def message_of(value: Any, stamp: int, frame_id: str) -> Any:
     raise ValueError(f"{shown} has no standard form")
 
 
+def array_of(message: Any) -> Array:
+    """The array of a sensor_msgs/Image, Float64MultiArray or Int64MultiArray of `message_of`."""
+    if hasattr(message, "layout"):
+        return np.array(message.data).reshape([dimension.size for dimension in message.layout.dim])
+    dtype, dimensions = {name: form for form, name in ros2.IMAGE_ENCODINGS.items()}[message.encoding]
+    shape = (message.height, message.width, 3)[:dimensions]
+    return np.array(message.data, np.uint8).view(dtype).reshape(shape)
+
+
 def _beyond_64_bits(value: Any) -> bool:
     """Whether a whole number, or one of an array, does not fit 64 bits with a sign, which the messages have."""
     if isinstance(value, np.ndarray):

@@ -29,7 +29,7 @@ from stages.data.rotations import canonical, quaternion_of
 
 FLOAT32 = 7  # sensor_msgs/PointField.FLOAT32
 
-_IMAGE_ENCODINGS = {
+IMAGE_ENCODINGS: dict[tuple[np.dtype[Any], int], str] = {  # dtype and dimensions -> encoding
     (np.dtype(np.uint8), 2): "mono8",
     (np.dtype(np.uint8), 3): "rgb8",
     (np.dtype(np.uint16), 2): "mono16",
@@ -49,14 +49,14 @@ def header(stamp: int, frame_id: str) -> Any:
 
 def has_encoding(pixels: Array) -> bool:
     """Whether `image` takes these pixels."""
-    return (pixels.dtype, pixels.ndim) in _IMAGE_ENCODINGS and (pixels.ndim == 2 or pixels.shape[2] == 3)
+    return (pixels.dtype, pixels.ndim) in IMAGE_ENCODINGS and (pixels.ndim == 2 or pixels.shape[2] == 3)
 
 
 def image(stamp: int, frame_id: str, pixels: Array) -> Any:
     """sensor_msgs/Image of (H, W) integers or floats (NaN = unknown), or (H, W, 3) RGB uint8 or uint16."""
     if not has_encoding(pixels):
         raise ValueError(f"no ROS image encoding for {pixels.dtype} {pixels.shape}")
-    encoding = _IMAGE_ENCODINGS[pixels.dtype, pixels.ndim]
+    encoding = IMAGE_ENCODINGS[pixels.dtype, pixels.ndim]
     height, width = pixels.shape[:2]
     data = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)).view(np.uint8).reshape(-1)
     return make(

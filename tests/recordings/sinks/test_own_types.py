@@ -16,6 +16,7 @@ from recordings import McapSink
 from recordings.errors import LogError
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
+from recordings.ros2.plain import array_of
 from recordings.sinks.own_types import leaves, refusal
 from stages.data import Disparity, StereoFrame, Transform
 from tests.conftest import FRAMES, roverflow
@@ -105,6 +106,7 @@ def test_images_become_sensor_msgs_images(tmp_path, dtype, shape, encoding):
     pixels = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
     read = written(tmp_path / "out.mcap", {"own/image": np.ndarray}, {"own/image": pixels})["/nav/own/image"]
     assert (read.__msgtype__, read.encoding, read.height, read.width) == ("sensor_msgs/msg/Image", encoding, 4, 6)
+    np.testing.assert_array_equal(array_of(read), 255 * pixels.astype(np.uint8) if dtype is bool else pixels)
     if encoding == "mono8" and dtype is bool:
         np.testing.assert_array_equal(read.data.reshape(4, 6), 255 * pixels.astype(np.uint8))
     elif encoding == "32FC1":
@@ -124,6 +126,13 @@ def test_a_dataclass_becomes_a_topic_per_field(tmp_path):
     }  # fmt: skip
     assert read["/nav/own/mask"].header.frame_id == "camera"
     assert read["/nav/own/histogram"].data.tolist() == [0, 1, 2, 3]
+    assert array_of(read["/nav/own/range_m"]).tolist() == [0.5, 8.0]
+
+
+def test_an_array_of_more_dimensions_is_read_back_in_its_shape(tmp_path):
+    tensor = np.arange(24, dtype=np.int32).reshape(2, 3, 4)
+    read = written(tmp_path / "out.mcap", {"own": np.ndarray}, {"own": tensor})["/nav/own"]
+    np.testing.assert_array_equal(array_of(read), tensor)
 
 
 def test_keys_of_a_table_that_share_a_topic_are_an_error(tmp_path):
@@ -170,8 +179,11 @@ def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
     read = list(iter_decoded(out, ["/nav/sharpness", "/nav/edges"]))
     assert [topic for topic, *_ in read] == FRAMES * ["/nav/sharpness", "/nav/edges"]
     assert [frame.items["sharpness"] for frame in read_result(out, ["sharpness"])] == [m.data for _, _, m in read[::2]]
-    with pytest.raises(LogError, match="stream 'edges' is sensor_msgs/msg/Image, which read_result does not read; it"):
-        next(read_result(out, ["edges"]))
+    for frame, (_, _, image) in zip(read_result(out, "edges"), read[1::2], strict=True):
+        np.testing.assert_array_equal(frame.items["edges"], image.data.reshape(image.height, image.width))
+    assert set(next(read_result(out)).items) == {"sharpness", "edges"}
+    with pytest.raises(LogError, match=r"stream 'diagnostics' is .*/DiagnosticArray, which read_result does not read"):
+        next(read_result(out, ["diagnostics"]))
     assert {"/sharpness", "/edges"} <= entities(out.with_suffix(".rrd"))
 
 
