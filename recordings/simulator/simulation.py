@@ -44,10 +44,10 @@ def _rad(degrees: float) -> float:
 class FrameTruth:
     """The exact geometry of one frame.
 
-    mounts: base_link <- left camera, <- right; depth: (H, W) float64 m, inf = sky; surface: (H, W) int32 codes of
-    the ray caster; seen: (H, W) uint8, 255 by both cameras, 128 hidden from the right one, 0 no surface; images: left
-    and right; terrain_class: (H, W) uint8, the `TerrainClass` of each pixel; jpegs: the bytes of both images' files, if
-    they are compressed.
+    base: world <- base_link; mounts: base_link <- left camera, <- right; level: world <- frame `level`; depth: (H, W)
+    float64 m, inf = sky; surface: (H, W) int32 codes of the ray caster; seen: (H, W) uint8, 255 by both cameras, 128
+    hidden from the right one, 0 no surface; images: left and right; terrain_class: (H, W) uint8, the `TerrainClass` of
+    each pixel; jpegs: the bytes of both images' files, if they are compressed.
     """
 
     base: Transform
@@ -75,9 +75,14 @@ class Simulation:
     Examples
     --------
     >>> from recordings.simulator import Simulation
+    >>> from stages import StereoFrame, Tilt
     >>> simulation = Simulation(frames=2, width=320, height=240, relief_cells=256)
-    >>> simulation.frame(0).depth.shape
-    (240, 320)
+    >>> truth, camera = simulation.frame(0), simulation.camera
+    >>> frame = StereoFrame(0, *truth.images, camera)
+    >>> disparity = camera.fx * camera.baseline / truth.depth
+    >>> tilt = Tilt(0, (truth.base.rotation @ truth.mounts[0].rotation)[2], camera.frame_id)
+    >>> disparity.shape, float(tilt.up[1]) < -0.9
+    ((240, 320), True)
     """
 
     scene: str = parameter(DEFAULT_SCENE, "named defaults of ground, light and noise", choices=SCENES)
