@@ -83,8 +83,8 @@ class Merged:
                 yield (
                     found.conflicts > MAX_CONFLICT_SHARE * found.cells,
                     (
-                        f"{names} conflict in {found.conflicts} of {found.cells} common cells: the second is higher by "
-                        f"{found.mean:+.3f} m on average, by {found.largest:+.3f} m at ({x:.2f}, {y:.2f}) m"
+                        f"{names} conflict in {found.conflicts} of {found.cells} common cells: second minus first is "
+                        f"{found.mean:+.3f} m on average, {found.largest:+.3f} m at ({x:.2f}, {y:.2f}) m"
                     ),
                 )
         paired = {number for pair in self.overlaps for number in pair}
