@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -96,6 +97,11 @@ class ElevationMap:
                 raise StageError(f"ElevationMap layer '{name}' must be float32 ({rows}, {cols})")
         object.__setattr__(self, "layers", MappingProxyType({n: read_only(layer) for n, layer in layers.items()}))
         object.__setattr__(self, "shape", (rows, cols))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled and copied by its fields, as the read-only mapping cannot be."""
+        layers = dict(self.layers)
+        return type(self), (self.stamp, layers, self.resolution, self.origin, self.frame_id, self.level, self.epoch)
 
 
 @dataclass(frozen=True, eq=False)

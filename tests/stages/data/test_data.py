@@ -1,5 +1,7 @@
 """The data types check their fields, and their arrays are read-only afterwards."""
 
+import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
@@ -58,6 +60,20 @@ def test_publishing_a_view_leaves_the_rest_of_its_base_writable():
     with pytest.raises(ValueError, match="read-only"):
         part.pixels[0, 0] = 1
     whole[3] = 1
+
+
+@pytest.mark.parametrize("copied", [lambda item: pickle.loads(pickle.dumps(item)), copy.deepcopy])
+def test_an_elevation_map_is_pickled_and_copied(copied):
+    layers = {"elevation": np.eye(2, 3, dtype=F32), "count": np.ones((2, 3), F32)}
+    given = ElevationMap(7, layers, 0.1, (1.0, 2.0), "odom", Transform("odom", "level", np.eye(3), np.ones(3)), 5)
+    found = copied(given)
+    for name in ("stamp", "resolution", "origin", "frame_id", "epoch", "shape"):
+        assert getattr(found, name) == getattr(given, name)
+    assert found.level.translation.tolist() == [1, 1, 1]
+    assert found.layers.keys() == layers.keys()
+    for name, layer in found.layers.items():
+        np.testing.assert_array_equal(layer, layers[name])
+        assert not layer.flags.writeable
 
 
 def test_small_arrays_are_copied():
