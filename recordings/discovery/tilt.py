@@ -30,14 +30,15 @@ def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedT
     """Find the inclinometer, and for an estimate the gyroscope."""
     topics = [topic for topic in topics if topic.messages]
     found.tilt = _kind_set(settings)
-    given = settings.inclinometer
+    apart = settings.pitch.topic if settings.pitch is not None else None
+    given, setting = (apart, "pitch.topic") if apart is not None else (settings.inclinometer, "inclinometer")
     if given is None:
         _search_tilt(topics, messages, found)
     else:
         topic = next((topic for topic in topics if topic.name == given), None)
         if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
             candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
-            found.refuse("inclinometer", "inclinometer", not_there("inclinometer", given, "tilt", candidates))
+            found.refuse("inclinometer", setting, not_there(setting, given, "tilt", candidates))
             found.offer("inclinometer", "inclinometer", [t.name for t in candidates if t.schema in TILTS])
         elif found.tilt == TiltKind.ORIENTATION and topic.schema not in TILTS:
             found.refuse("inclinometer", "inclinometer", _undefined(topic))

@@ -7,6 +7,7 @@ become a direction by the model in the pipeline file; accelerations at rest are 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import MISSING, dataclass
 from functools import lru_cache
@@ -25,6 +26,7 @@ Vector = tuple[float, float, float]
 
 MIN_ACCELERATION = 0.1  # m/s^2; less contains no gravity
 MAX_STATED_SIGMA = np.radians(20.0)  # beyond it a covariance says only that the driver does not know
+MAX_WAITING_ROLLS = 1000  # that no pitch follows
 _MAX_PLACES = 100  # of an array of numbers, that a field may be
 
 
@@ -66,8 +68,7 @@ def tilt_of_pose(message: Any, log_time: int, upright: str, base_frame: str) -> 
 
 def sample_of(message: Any, log_time: int, acceleration: Vector | None, rate: Vector | None) -> InertialSample:
     """An acceleration, m/s^2, and a rate, rad/s, of that message, with its stamp."""
-    header = getattr(message, "header", None)
-    return InertialSample(stamp_or(header, log_time) if header is not None else log_time, rate, acceleration)
+    return InertialSample(_stamp_of(message, log_time), rate, acceleration)
 
 
 def acceleration_of(message: Any) -> Vector | None:
@@ -96,9 +97,13 @@ def _finite_vector(values: list[Any], name: str) -> Vector:
 
 
 def _tilt(message: Any, log_time: int, up: Array, sigma: float | None = None) -> Tilt:
+    return Tilt(_stamp_of(message, log_time), up / math.hypot(*up), frame_of(message) or "inclinometer", sigma)
+
+
+def _stamp_of(message: Any, log_time: int) -> int:
+    """The stamp of a message, ns; of one without a header the log time."""
     header = getattr(message, "header", None)
-    stamp = stamp_or(header, log_time) if header is not None else log_time
-    return Tilt(stamp, up / math.hypot(*up), frame_of(message) or "inclinometer", sigma)
+    return stamp_or(header, log_time) if header is not None else log_time
 
 
 def _stated_sigma(covariance: Array) -> float | None:
@@ -124,6 +129,11 @@ class AngleField(Checked):
     field: str = parameter(MISSING, "path of the field in the message, such as vector.x")
     unit: str = parameter(MISSING, "unit of its numbers", choices=("deg", "rad"))
     sign: int = parameter(MISSING, "1: positive is nose up (pitch) or left side up (roll)", choices=(1, -1))
+    topic: str | None = parameter(None, "topic of the message, where pitch and roll are on two; none: inclinometer")
+
+    def check(self, message: Any) -> None:
+        """Raise LogError if the field is not a number."""
+        _number(message, self.field)
 
     def __call__(self, message: Any) -> float:
         """The angle in radians, with our sign."""
@@ -199,14 +209,35 @@ class BareAngles:
     roll: AngleField
     model: Literal["axis", "euler"]
 
-    def check(self, message: Any) -> None:
-        """Raise LogError if a field is not a number."""
-        for angle in (self.pitch, self.roll):
-            _number(message, angle.field)
-
     def __call__(self, message: Any, log_time: int) -> Tilt:
         """The tilt by the two angles of a message."""
         return _tilt(message, log_time, up_of(self.pitch(message), self.roll(message), self.model))
+
+
+class JoinedAngles:
+    """Converts pitch and roll of two topics to a direction at the stamps of rolls, with the pitch interpolated."""
+
+    def __init__(self, angles: BareAngles) -> None:
+        self._angles = angles
+        self._pitch: tuple[int, float] | None = None  # the last one, with its stamp
+        self._rolls = deque[tuple[Any, int]](maxlen=MAX_WAITING_ROLLS)  # later than it, with their log times
+
+    def add_roll(self, message: Any, log_time: int) -> None:
+        """Keep a roll until the next pitch."""
+        self._angles.roll(message)  # raises LogError
+        self._rolls.append((message, log_time))
+
+    def add_pitch(self, message: Any, log_time: int) -> Tilt | None:
+        """The tilt at the last roll between the pitch before and this one; None if there is none."""
+        end, after = _stamp_of(message, log_time), self._angles.pitch(message)
+        begin, before = self._pitch or (end, after)
+        self._pitch, found = (end, after), None
+        while self._rolls and _stamp_of(*self._rolls[0]) <= end:
+            found = self._rolls.popleft()
+        if found is None or (stamp := _stamp_of(*found)) < begin:
+            return None
+        pitch = after if stamp == end else before + (after - before) * (stamp - begin) / (end - begin)
+        return _tilt(*found, up_of(pitch, self._angles.roll(found[0]), self._angles.model))
 
 
 def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:

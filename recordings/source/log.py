@@ -348,15 +348,15 @@ class McapLog:
         if reading.estimates:
             readers = [self._reader("inclinometer", topic, lambda *_: None) for topic in reading.samplers(self.source)]
             return [replace(reader, decoders=dict.fromkeys(reader.decoders, bytes)) for reader in readers]
-        tilt, known = reading.reader(self.source), self.resolution.tilt_frame
+        tilts, known = reading.readers(self.source), self.resolution.tilt_frame
 
-        def checked(message: Any, log_time: int) -> Tilt | None:
+        def checked(tilt: Callable[[Any, int], Tilt | None], message: Any, log_time: int) -> Tilt | None:
             made = tilt(message, log_time)
             if made is not None and known and made.frame_id != known:
                 raise LogError(f"its frame is '{made.frame_id}', but the mount is that of '{known}'")
             return None if made is None else noise(made)
 
-        return [self._reader("inclinometer", reading.topic, checked)]
+        return [self._reader("inclinometer", topic, partial(checked, tilt)) for topic, tilt in tilts.items()]
 
     def _transform_readers(self, moving: MovingMount, items: dict[int, TopicReader]) -> Iterator[TopicReader]:
         """The readers of the transforms that move the camera; the topic may also be that of the pose."""

@@ -117,13 +117,17 @@ class SourceResolution:
     def _discovered(self) -> DiscoveredTopics:
         """The topic of each role, and why other roles have none."""
         angles, found = self.source.angles(), discover(self.messages, self.source)
-        check = self.source.accelerations if angles is None else angles.check
-        if check is not None and (topic := found.chosen.get("inclinometer")):
-            checked = self.messages.first(topic, check)
+        if (topic := found.chosen.get("inclinometer")) is None:
+            return found
+        checks: list[tuple[str, Any]] = [(topic, self.source.accelerations)]
+        if angles is not None:
+            checks = [(angle.topic or topic, angle.check) for angle in (angles.pitch, angles.roll)]
+        for of, check in checks:
+            checked = None if check is None else self.messages.first(of, check)
             if isinstance(checked, LogError):
-                del found.chosen["inclinometer"]
+                found.chosen.pop("inclinometer", None)
                 names = "accelerations" if angles is None else "pitch and roll"
-                found.refuse("inclinometer", names, f"the {found.tilt} of {topic}: {checked}")
+                found.refuse("inclinometer", names, f"the {found.tilt} of {of}: {checked}")
         return found
 
     def notes(self, estimator: UpEstimator | None) -> list[tuple[str, str]]:

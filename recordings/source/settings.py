@@ -108,6 +108,10 @@ class LogSettings:
         for name, value in given.items():
             if value is None:
                 raise ValueError(f"McapSource needs '{name}': bare angles need pitch, roll and tilt_model")
+        if (self.pitch.topic is None) != (self.roll.topic is None):  # type: ignore[union-attr]
+            raise ValueError(
+                "McapSource needs 'pitch.topic' and 'roll.topic', or neither if one message has both angles"
+            )
         model: Any = self.tilt_model
         return BareAngles(self.pitch, self.roll, model)  # type: ignore[arg-type]  # none of them is None
 

@@ -16,6 +16,7 @@ from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
 from recordings.inertial.up_estimator import UpEstimator
 from recordings.ros2.tilt_from_msg import (
+    JoinedAngles,
     Vector,
     acceleration_of,
     rate_of,
@@ -49,16 +50,21 @@ class TiltReading:
     turn: Array = field(default_factory=lambda: np.eye(3))
     why: str = ""
 
-    def reader(self, settings: LogSettings) -> Callable[[Any, int], Tilt | None]:
-        """The function from a message and its log time to its tilt."""
+    def readers(self, settings: LogSettings) -> dict[str, Callable[[Any, int], Tilt | None]]:
+        """Topic -> the function from a message and its log time to its tilt, if it has one."""
+        made: Callable[[Any, int], Tilt | None] = tilt_of
         if (angles := settings.angles()) is not None:
-            return angles
-        if (upright := settings.upright_frame) is not None:
-            return lambda message, log_time: tilt_of_pose(message, log_time, upright, settings.base_frame)
-        if self.kind == TiltKind.ACCELERATIONS:
+            roll = angles.roll.topic or self.topic
+            if roll != self.topic:
+                joined = JoinedAngles(angles)
+                return {self.topic: joined.add_pitch, roll: joined.add_roll}
+            made = angles
+        elif (upright := settings.upright_frame) is not None:
+            made = lambda message, time: tilt_of_pose(message, time, upright, settings.base_frame)  # noqa: E731
+        elif self.kind == TiltKind.ACCELERATIONS:
             read = settings.accelerations or acceleration_of
-            return lambda message, log_time: tilt_of_acceleration(message, log_time, read(message))
-        return tilt_of
+            made = lambda message, time: tilt_of_acceleration(message, time, read(message))  # noqa: E731
+        return {self.topic: made}
 
     @property
     def estimates(self) -> bool:

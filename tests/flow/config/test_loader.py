@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from flow.config.loader import load
 from flow.errors import PipelineError, UsageError
 from flow.units import as_written, quantity
+from recordings.ros2.tilt_from_msg import AngleField
 
 GOOD = """\
 source: {use: tests.flow.toys.Source, gain: 2.5}
@@ -78,8 +79,8 @@ def test_one_key_of_a_mapping_is_replaced_alone(tmp_path):
     """
     settings = [f"source.roll.{key}" for key in ("field=vector.y", "unit=rad", "sign=1")]
     source = loaded(tmp_path, text, ["source.pitch.sign=-1", "source.tilt_model=axis", *settings]).source
-    assert vars(source.pitch) == {"field": "vector.x", "unit": "deg", "sign": -1}
-    assert vars(source.roll) == {"field": "vector.y", "unit": "rad", "sign": 1}
+    assert source.pitch == AngleField("vector.x", "deg", -1)
+    assert source.roll == AngleField("vector.y", "rad", 1)
     with pytest.raises(PipelineError, match=r"--set source.pitch.sign=-2: .*must be one of 1, -1, not -2"):
         loaded(tmp_path, text, ["source.tilt_model=axis", *settings, "source.pitch.sign=-2"])
 
@@ -101,8 +102,8 @@ sinks: [{use: tests.flow.toys.Keep}]
 ])  # fmt: skip
 def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, overrides, pitch, roll):
     source = loaded(tmp_path, SHARED_ANGLE, overrides).source
-    assert vars(source.pitch) == {"field": "vector.x", "unit": "deg", "sign": pitch}
-    assert vars(source.roll) == {"field": "vector.x", "unit": "deg", "sign": roll}
+    assert source.pitch == AngleField("vector.x", "deg", pitch)
+    assert source.roll == AngleField("vector.x", "deg", roll)
 
 
 @pytest.mark.parametrize(("old", "new", "line", "words"), [

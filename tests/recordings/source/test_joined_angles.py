@@ -1,0 +1,87 @@
+"""Pitch and roll on two topics: each tilt has both angles of one time."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recordings import McapSource
+from recordings.mcap.writer import Ros2Writer
+from recordings.ros2.cdr import make
+from recordings.ros2.tilt_from_msg import AngleField, up_of
+from recordings.ros2.to_msg import header
+from stages.data import Tilt
+from tests.recordings.sample_log import START, TILT, dropped, items_of, missing_in, refused_in, write_sample
+
+FACING = (0.5, -0.5, 0.5, 0.5)
+PITCH, ROLL = AngleField("data", "deg", 1, "/pitch"), AngleField("data", "deg", 1, "/roll")
+LENGTH = 400_000_000  # ns, of the sample
+LATER = 7_000_000  # ns, by which rolls are measured after pitches
+
+
+def angles_at(stamp: int) -> tuple[float, float]:
+    """Pitch and roll at a time, degrees."""
+    seconds = (stamp - START) / 1e9
+    return 10 + 20 * seconds, 5 - 30 * seconds
+
+
+def source(**changes: object) -> McapSource:
+    settings = {"pitch": PITCH, "roll": ROLL, "tilt_model": "axis", "camera_from_inclinometer": FACING, **changes}
+    return McapSource(**settings)
+
+
+def logged(folder: Path, hertz: tuple[int, int] = (20, 20), late: int = 0, bad: int = -1) -> list[Path]:
+    """The sample without its Imu, and a file of angles. late: pitches are logged so long after their stamps, ns, or 0
+    for messages without stamps; bad: number of a roll that is not a number."""
+    rows = []
+    for topic, rate, first, delay in (("/pitch", hertz[0], 0, late), ("/roll", hertz[1], LATER, 0)):
+        for number, stamp in enumerate(range(START + first, START + LENGTH + 1, 1_000_000_000 // rate)):
+            angle = np.nan if (topic, number) == ("/roll", bad) else angles_at(stamp)[topic == "/roll"]
+            message = make("std_msgs/msg/Float64", data=angle)
+            if late:
+                vector = make("geometry_msgs/msg/Vector3", x=angle, y=0.0, z=0.0)
+                message = make("geometry_msgs/msg/Vector3Stamped", header=header(stamp, "tilt_link"), vector=vector)
+            rows.append((stamp + delay, topic, message))
+    angles = folder / "angles.mcap"
+    with Ros2Writer(angles) as writer:
+        for time, topic, message in sorted(rows, key=lambda row: row[0]):
+            writer.write(topic, message, time)
+    return [write_sample(folder / "sample.mcap", dropped(TILT)), angles]
+
+
+@pytest.mark.parametrize("late", [0, 30_000_000])
+@pytest.mark.parametrize("hertz", [(20, 20), (100, 20), (20, 100), (50, 30)])
+def test_a_tilt_has_the_pitch_at_the_time_of_its_roll(tmp_path, hertz, late):
+    field = "vector.x" if late else "data"
+    settings = source(pitch=replace(PITCH, field=field), roll=replace(ROLL, field=field))
+    events = items_of(logged(tmp_path, hertz, late), settings)
+    assert [time for time, _, _ in events] == sorted(time for time, _, _ in events)
+    tilts = [item for _, stream, item in events if stream == "inclinometer"]
+    assert len(tilts) >= 0.4 * min(hertz) - 1
+    stamps = [tilt.stamp for tilt in tilts]
+    assert stamps == sorted({*stamps})
+    for tilt in tilts:
+        np.testing.assert_allclose(tilt.up, up_of(*np.deg2rad(angles_at(tilt.stamp)), "axis"), atol=1e-9)
+
+
+def test_a_bad_roll_is_lost_alone(tmp_path):
+    items = [item for _, stream, item in items_of(logged(tmp_path, bad=3), source()) if stream == "inclinometer"]
+    (lost,) = (str(item) for item in items if isinstance(item, Exception))
+    assert "/roll at" in lost
+    assert "field 'data' contains nan, which is not an angle" in lost
+    stamps = [item.stamp for item in items if isinstance(item, Tilt)]
+    assert stamps == [START + LATER + number * 50_000_000 for number in range(8) if number != 3]
+
+
+def test_a_topic_that_the_log_lacks_is_refused(tmp_path):
+    paths = logged(tmp_path)
+    settings = {"tilt_model": "axis", "camera_from_inclinometer": FACING}
+    why = missing_in(paths, pitch=PITCH, roll=replace(ROLL, topic="/rol"), **settings)["inclinometer"]
+    assert why == "the bare angles of /rol: /rol has no messages"
+    assert (
+        "the source's 'pitch.topic' is set to /pich"
+        in (refused_in(paths, pitch=replace(PITCH, topic="/pich"), roll=ROLL, **settings)["pitch.topic"])
+    )
+    with pytest.raises(ValueError, match=r"needs 'pitch\.topic' and 'roll\.topic', or neither"):
+        source(roll=replace(ROLL, topic=None))
