@@ -37,9 +37,21 @@ def replay(
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
 
-    on_frame: called after each frame, with whether it is complete, in place of a progress bar; live_pipe: file
-    descriptor that gets the recording while it is written; 0: none; profile: of the result log; desk: layout of the
-    recording; None: as the pipeline says; with_inputs: copy the messages of the log into the result log.
+    Parameters
+    ----------
+    log, pipeline, out, rrd, overrides, workers, start, end, profile, desk, with_inputs
+        As of `roverflow run`; `overrides` has the texts of --set.
+    every
+        `flow.runtime.frame_selection.Every(frames=2)` or `Every(metres=0.5)`.
+    on_frame
+        Called after each frame, with whether it is complete, in place of a progress bar.
+    live_pipe
+        File descriptor that gets the recording while it is written; 0: none.
+
+    Examples
+    --------
+    >>> replay("traverse.mcap", "rover", "nav.mcap", None, overrides=["disparities=128"])["verdict"]  # doctest: +SKIP
+    'COMPLETE'
     """
     from flow.config import loader as pipelines
     from flow.runtime.interrupts import Stop, interrupts

@@ -85,8 +85,25 @@ def import_scene(folder: Path, out: Path) -> str:
 
 
 def read_scene(folder: Path | str, stamp: int = FIRST_STAMP) -> MiddleburyScene:
-    """The scene of a folder, with its frame at `stamp`, ns. Raises LogError if a file is missing (the truth may be) or
-    cannot be used."""
+    """The scene of a folder.
+
+    Parameters
+    ----------
+    folder
+        With im0.png, im1.png and calib.txt; disp0GT.pfm and mask0nocc.png may be missing.
+    stamp
+        Of the frame, ns.
+
+    Raises
+    ------
+    LogError
+        If a file is missing or cannot be used.
+
+    Examples
+    --------
+    >>> read_scene("trainingQ/Teddy").ndisp  # doctest: +SKIP
+    64
+    """
     folder = Path(folder)
     if not (folder / CALIBRATION).is_file():
         raise LogError(f"{folder} has no {CALIBRATION}; give the folder of one scene")
