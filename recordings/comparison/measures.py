@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy_grid
+from recordings.ros2.plain import array_of
 from stages.data import Array, Cell, NavigationMap
 
 Measures = dict[str, float]
@@ -114,9 +115,12 @@ def _verdicts(one: Any, other: Any) -> Measures:
     }
 
 
-def _codes(one: Any, other: Any) -> Measures:
-    first, second = (np.frombuffer(bytes(message.data), np.uint8) for message in (one, other))
-    return {"pixels": float(np.sum(first != second)) if first.shape == second.shape else float(first.size)}
+def _images(one: Any, other: Any) -> Measures:
+    first, second = array_of(one), array_of(other)
+    if first.shape != second.shape:
+        return {"pixels of another size": float(one.height * one.width)}
+    changed = _differ(first, second)
+    return {"pixels": float(np.sum(changed.any(axis=2) if changed.ndim == 3 else changed))}
 
 
 def _poses(one: Any, other: Any) -> Measures:
@@ -155,7 +159,7 @@ _MEASURES: Mapping[str, Callable[[Any, Any], Measures]] = {
     "stereo_msgs/msg/DisparityImage": _disparities,
     "grid_map_msgs/msg/GridMap": _maps,
     "nav_msgs/msg/OccupancyGrid": _verdicts,
-    "sensor_msgs/msg/Image": _codes,
+    "sensor_msgs/msg/Image": _images,
     "nav_msgs/msg/Odometry": _poses,
     "sensor_msgs/msg/PointCloud2": _points,
 }

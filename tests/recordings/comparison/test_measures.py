@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.comparison.measures import measures
-from recordings.ros2.to_msg import disparity_image, odometry
+from recordings.ros2.to_msg import disparity_image, image, odometry
 from stages.data import Pose
 from tests.recordings.sinks.recorded_scene import scene
 
@@ -32,3 +32,16 @@ def test_equal_disparities_of_another_camera_differ_by_its_baseline():
     pair = disparity_image(disparity), disparity_image(replace(disparity, camera=camera))
     found = measures("stereo_msgs/msg/DisparityImage", *pair)
     assert found == {"largest difference of the baselines mm": pytest.approx(100 * disparity.camera.baseline)}
+
+
+@pytest.mark.parametrize(
+    ("dtype", "channels", "unknown"), [(np.uint8, (), 0), (np.uint8, (3,), 0), (np.float32, (), np.nan)]
+)
+def test_a_changed_pixel_of_an_image_counts_once(dtype, channels, unknown):
+    pixels = np.full((4, 6, *channels), 7, dtype)
+    pixels[0, 0] = unknown
+    changed = pixels.copy()
+    changed[1, 2:4] = 200
+    one, other, small = (image(0, "camera", array) for array in (pixels, changed, pixels[:2]))
+    assert measures("sensor_msgs/msg/Image", one, other) == {"pixels": 2}
+    assert measures("sensor_msgs/msg/Image", one, small) == {"pixels of another size": 24}
