@@ -6,9 +6,8 @@ little ahead of the images, so that no image is delivered with a calibration tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from heapq import merge
 from itertools import chain
 from operator import itemgetter
@@ -25,18 +24,15 @@ from recordings.containers.opening import open_recording
 from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInRange, TimeRange
 from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
-from recordings.ros2.from_msg import pose_of
-from recordings.source.cameras import CAMERAS, CalibrationHistory, ImageReading
-from recordings.source.mount import pose_of_base
+from recordings.source.cameras import CAMERAS, CalibrationHistory
 from recordings.source.moving_mount import MovingMount
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
-from recordings.source.tilt_noise import TiltNoise
-from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts
+from recordings.source.stream_readers import StreamReaders, by_channel
+from recordings.source.tilt_reading import Sampled, estimated_tilts
 from recordings.source.topics import TopicReader, attempt, with_lookahead
-from recordings.video.decoder import VideoDecoder
 from recordings.video.formats import VIDEO, VIDEO_NOTE
-from stages.data import CameraImage, Mount, Pose, Tilt
+from stages.data import CameraImage, Mount
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
 MAX_CALIBRATION_LAG_NS = 100_000_000  # a calibration may be logged this much later than its image
@@ -73,6 +69,7 @@ class McapLog:
             self.path = self.file.path
             self._check_range()
             self.resolution = resolution = SourceResolution(self.file, self.source)
+            self._readers = StreamReaders(resolution, self.source)
             self.missing, self.refused, self.topics = resolution.missing, resolution.refused, resolution.topics
             self._check_images()
         except BaseException:
@@ -132,15 +129,14 @@ class McapLog:
     ) -> Iterator[tuple[int, str, Any]]:
         events, tilt = self._read(part, frames, streams, ahead), self.resolution.tilt
         if "inclinometer" in streams and "inclinometer" in self.topics and tilt is not None and tilt.estimates:
-            events = merge(events, self._estimated(tilt, part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
+            events = merge(events, self._estimated(part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
         for log_time, stream, item in events:
             offset = 0 if isinstance(item, Exception) else self.time_offset(stream)
             yield log_time, stream, replace(item, stamp=item.stamp + offset) if offset else item
 
-    def _estimated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
+    def _estimated(self, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
         """The estimates of up in a part of the log, also from samples before and after."""
-        samplers = tilt.samplers(self.source)
-        readers = self._by_channel(self._reader("inclinometer", topic, made) for topic, made in samplers.items())
+        readers = by_channel(self._readers.of_samples())
         source, wide = self.source, part.widened(LOOKAHEAD_NS)
         self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
         for log_time, item in estimated_tilts(self._samples(readers, wide), self._estimator):
@@ -167,16 +163,16 @@ class McapLog:
         if self.resolution.mount is not None and "mount" in streams and moving is None:
             yield log_start, "mount", self.resolution.mount
         calibrations = {side: CalibrationHistory(info.model) for side, info in self.resolution.infos.items()}
-        readers = self._calibration_readers(calibrations, streams)
+        readers = self._readers.of_calibrations(calibrations, streams)
         if log_start > self.file.start:
             for reader in readers:
                 self._note_last_before(log_start, reader)
-        infos, given = self._by_channel(readers), self._stream_readers(calibrations, streams)
-        items = self._by_channel(given)
+        infos, given = by_channel(readers), self._readers.of_streams(calibrations, streams)
+        items = by_channel(given)
         # An Odometry may be the pose and the tilt.
         twins = {channel: each for each in given for channel in each.decoders if items[channel] is not each}
         if moving is not None:
-            infos |= self._by_channel(self._transform_readers(moving, items))
+            infos |= by_channel(self._readers.of_transforms(moving, items))
         if wide.low is not None:
             for reader in items.values():
                 self._begin_video(wide.low, reader)
@@ -316,84 +312,6 @@ class McapLog:
         """The part of the log to read."""
         return TimeRange.after(self.file.start, self.start, self.end)
 
-    def _calibration_readers(
-        self, calibrations: dict[str, CalibrationHistory], streams: Collection[str]
-    ) -> list[TopicReader]:
-        return [
-            self._reader(side, info.topic, calibrations[side].note)
-            for side, info in self.resolution.infos.items()
-            if side in self.topics and side in streams
-        ]
-
-    def _stream_readers(
-        self, calibrations: dict[str, CalibrationHistory], streams: Collection[str]
-    ) -> list[TopicReader]:
-        base_frame = self.source.base_frame
-        made: dict[str, Callable[[Any, int], Any]] = {
-            "odometry": lambda message, log_time: self._rover_pose(pose_of(message, log_time, base_frame)),
-        }
-        read = self.resolution.messages.pixel_reader
-        for side, camera in zip(CAMERAS, self.resolution.cameras or (), strict=False):
-            if side in self.topics:
-                made[side] = ImageReading(camera, calibrations[side], read(self.topics[side]))
-        chosen = [(stream, topic) for stream, topic in self.topics.items() if stream in made and stream in streams]
-        readers = [self._reader(stream, topic, made[stream]) for stream, topic in chosen]
-        return [*readers, *self._tilt_readers()] if "inclinometer" in streams else readers
-
-    def _tilt_readers(self) -> list[TopicReader]:
-        """The readers of the inclinometer; those of an estimate only stand for lost messages."""
-        if "inclinometer" not in self.topics or self.resolution.tilt is None:
-            return []
-        reading, noise = self.resolution.tilt, TiltNoise()
-        if reading.estimates:
-            readers = [self._reader("inclinometer", topic, lambda *_: None) for topic in reading.samplers(self.source)]
-            return [replace(reader, decoders=dict.fromkeys(reader.decoders, bytes)) for reader in readers]
-        tilts, known = reading.readers(self.source), self.resolution.tilt_frame
-
-        def checked(tilt: Callable[[Any, int], Tilt | None], message: Any, log_time: int) -> Tilt | None:
-            made = tilt(message, log_time)
-            if made is not None and known and made.frame_id != known:
-                raise LogError(f"its frame is '{made.frame_id}', but the mount is that of '{known}'")
-            return None if made is None else noise(made)
-
-        return [self._reader("inclinometer", topic, partial(checked, tilt)) for topic, tilt in tilts.items()]
-
-    def _transform_readers(self, moving: MovingMount, items: dict[int, TopicReader]) -> Iterator[TopicReader]:
-        """The readers of the transforms that move the camera; the topic may also be that of the pose."""
-        for topic in moving.topics:
-            pose = next((reader for reader in items.values() if reader.topic == topic), None)
-            if pose is None:
-                yield self._reader("mount", topic, moving.add)
-            else:
-                yield replace(pose, item=partial(_both, moving.add, pose.item))
-
-    def _rover_pose(self, pose: Pose | None) -> Pose | None:
-        cameras = self.resolution.cameras
-        if pose is None or cameras is None:
-            return pose
-        return pose_of_base(pose, cameras[0], self.source.base_frame, self.resolution.static)
-
-    def _reader(self, stream: str, topic: str, item: Callable[[Any, int], Any]) -> TopicReader:
-        messages = self.resolution.messages
-        decoders = {number: messages.decoders[number] for number in messages.channels_of(topic)}
-        pixels_of = item.pixels_of if isinstance(item, ImageReading) else None
-        made = _by_stamp_alone(item) if messages.ahead_of(topic) else item
-        return TopicReader(stream, topic, decoders, made, pixels_of if isinstance(pixels_of, VideoDecoder) else None)
-
     def _schema(self, stream: str) -> str:
         """The full name of the type of a stream's messages, or an empty string."""
         return self.resolution.messages.schemas.get(self.topics.get(stream, ""), "")
-
-    @staticmethod
-    def _by_channel(readers: Iterable[TopicReader]) -> dict[int, TopicReader]:
-        return {channel: reader for reader in readers for channel in reader.decoders}
-
-
-def _by_stamp_alone(item: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
-    """The same for stamps of another clock than the log times: a stamp of 0 is one."""
-    return lambda message, log_time: item(message, 0)
-
-
-def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], message: Any, log_time: int) -> Any:
-    first(message, log_time)
-    return then(message, log_time)
