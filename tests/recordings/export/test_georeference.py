@@ -72,10 +72,10 @@ def test_a_map_is_placed_to_a_centimetre(result, tmp_path, capsys):
     with rasterio.open(out[0] / "elevation.tif") as local, rasterio.open(out[1] / "elevation.tif") as placed:
         assert placed.crs.to_epsg() == 32633
         np.testing.assert_array_equal(local.read(1), placed.read(1))
-        for corner in ((0, 0), (local.width, 0), (0, local.height), (local.width, local.height)):
-            expected = on_grid(np.array([local.transform * corner]), scale)
-            np.testing.assert_allclose([placed.transform * corner], expected, atol=0.01)
-        centre = placed.transform * (0.5, 0.5)
+        for row, column in ((0, 0), (0, local.width), (local.height, 0), (local.height, local.width)):
+            expected = on_grid(np.array([local.xy(row, column, offset="ul")]), scale)
+            np.testing.assert_allclose([placed.xy(row, column, offset="ul")], expected, atol=0.01)
+        centre = placed.xy(0, 0)
     lines = [float(line) for line in (out[1] / "hillshade.pgw").read_text().split()]
     np.testing.assert_allclose(lines[4:], centre, atol=1e-6)
 
