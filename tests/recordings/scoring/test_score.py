@@ -17,7 +17,7 @@ from recordings.errors import LogError
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.scoring import score as scoring
-from recordings.scoring.result_log import names_of
+from recordings.scoring.result_log import input_beside, names_of
 from recordings.scoring.stereo_metrics import SURFACES
 from recordings.scoring.table import (
     ROWS,
@@ -436,3 +436,12 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     assert json.loads(empty.to_json())["terrain"]["heights"]["0-4 m"]["raw"]["rmse"] is None
     assert "nan" not in format_score(empty) + format_brief(empty)
     assert " 0.00% |      -      -      -      -            -" in format_score(empty)
+
+
+def test_the_files_of_an_input_are_beside_its_result_if_all_of_them_are(tmp_path):
+    result, files = tmp_path / "out.mcap", [tmp_path / "a.mcap", tmp_path / "b.mcap"]
+    with Ros2Writer(result) as log:
+        log.metadata("roverflow", {"log": "a.mcap, b.mcap"})
+    for file, beside in zip(files, ([tmp_path / "a.mcap, b.mcap"], files), strict=True):
+        file.touch()
+        assert input_beside(result) == beside

@@ -11,6 +11,7 @@ from flow.contracts import Finding, Severity
 from recordings.simulator.traverse import level_pose
 from stages import Mount, Pose, PoseFilter, Tilt, Transform
 from stages.data import Array
+from stages.localisation.pose_check import PoseCheck
 from tests.stages.localisation.drive import FRAMES, Drive, motions, readings
 from tests.stages.running import Running
 
@@ -165,6 +166,14 @@ def test_a_logged_pose_that_disagrees_with_the_images_is_a_warning(change, sente
     if found:
         assert re.search(sentence, found.sentence)
         assert found.severity == Severity.WARNING
+
+
+@pytest.mark.parametrize(("usual", "longest", "jumps"), [
+    (0.01, 0.6, True), (0.01, 0.4, False), (0.1, 1.2, True), (0.1, 0.9, False),
+])  # fmt: skip
+def test_a_jump_is_long_and_ten_times_the_usual_difference(usual, longest, jumps):
+    steps = [np.array([1.0, 1.0, difference]) for difference in [usual] * 10 + [longest]]
+    assert ("jumps 1 time" in PoseCheck(steps=steps).problem()) == jumps
 
 
 def test_without_base_link_the_pose_is_that_of_the_camera():
