@@ -8,9 +8,10 @@ from pathlib import Path
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
 from flow.errors import COMPLETE, UsageError
-from recordings.atomic_write import written
+from recordings.atomic_write import room_to_grow, unwritable, written
 from recordings.sinks import DESKS
 
+MAX_LAYOUT_BYTES = 4 << 20  # of a file; it grows with the number of streams, not with the length of the recording
 HELP = "write viewer layouts for a recording, one for each kind of question"
 
 
@@ -24,7 +25,6 @@ def run(options: argparse.Namespace) -> int:
     """Write a file for each desk."""
     from recordings.scoring.result_log import about_run
     from recordings.sinks.blueprint import APPLICATION, read_layout
-    from recordings.sinks.rerun_recording import check_room
 
     if about_run(options.recording):
         recording = options.recording.with_suffix(".rrd").name
@@ -36,7 +36,8 @@ def run(options: argparse.Namespace) -> int:
     layout = read_layout(options.recording)
     for name, path in paths.items():
         with written(path) as temporary:
-            check_room(temporary, path)
+            if room_to_grow(temporary) < MAX_LAYOUT_BYTES:  # rerun's writer never returns from a full disk
+                raise unwritable(path, f"less than {MAX_LAYOUT_BYTES >> 20} MB more can be written there")
             layout.blueprint(name).save(APPLICATION, str(temporary))
         say(f"wrote {path}; rerun {options.recording} {path} shows it")
     return COMPLETE

@@ -4,10 +4,12 @@ from typing import Any
 
 import pytest
 
+from flow.cli.debugging.desk import MAX_LAYOUT_BYTES
 from recordings.errors import LogError
 from recordings.sinks import DESKS as NAMES
 from recordings.sinks.blueprint import DESKS, Layout, Panel, ViewSpec, read_layout
 from tests.conftest import roverflow
+from tests.limits import file_size_limited
 from tests.recordings.sinks.recorded_scene import entities, rows
 
 
@@ -137,9 +139,15 @@ def test_the_desks_of_a_recording_are_files_for_the_viewer(rrd, tmp_path, capsys
 
 
 def test_a_desk_is_not_begun_on_a_full_disk(rrd, tmp_path, said, monkeypatch):
-    monkeypatch.setattr("recordings.sinks.rerun_recording.room_to_grow", lambda file: 1_000_000)
-    assert "less than 64 MB more can be written there; " in said(1, "desk", rrd, "--out", tmp_path).err
+    monkeypatch.setattr("flow.cli.debugging.desk.room_to_grow", lambda file: 1_000_000)
+    assert "less than 4 MB more can be written there; " in said(1, "desk", rrd, "--out", tmp_path).err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_desk_fits_on_a_disk_with_little_room(rrd, tmp_path):
+    with file_size_limited(5_000_000):
+        assert roverflow("desk", rrd, "--out", tmp_path) == 0
+    assert max(desk.stat().st_size for desk in tmp_path.iterdir()) < MAX_LAYOUT_BYTES / 4
 
 
 def test_what_is_no_recording_has_no_desk(tmp_path):
