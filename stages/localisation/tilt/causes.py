@@ -23,7 +23,7 @@ PARAMETER_COST = 4.0  # added to the score for each fitted number
 MIN_FRAMES = 8
 MIN_ANGLE = float(np.deg2rad(2.0))  # rad, of a mount error that is a fault
 MIN_OFFSET = 0.08  # s, of a time offset that is a fault
-MAX_OFFSET = 0.6  # s, of the time offsets tried
+MAX_OFFSET, MAX_LARGE_OFFSET = 0.6, 3.0  # s, of the time offsets tried; the large ones if the tilt is not sound
 MAX_FRAME_GAP = 1.5  # s, for a time offset to be measurable
 
 
@@ -191,10 +191,10 @@ def wrong_mount(fit: Fit) -> Cause:
     return fit.cause(fault, remedy, ups, 3, size=size, error=error, undone=turn @ mount)
 
 
-def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
-    """The delay of the tilt's stamps; None if frames are too far apart or too few to measure it."""
+def late_stamps(whole: Fit, sound: Cause, limit: float) -> Cause | None:
+    """The delay of the tilt's stamps, at most `limit` s; None if frames are too far apart or too few to measure it."""
     evidence = whole.evidence
-    within, splines = _splines(evidence)
+    within, splines = _splines(evidence, limit)
     kept = within >= 0
     if np.count_nonzero(kept) < MIN_FRAMES:
         return None
@@ -216,28 +216,28 @@ def late_stamps(whole: Fit, sound: Cause) -> Cause | None:
         return [fit.misfit(fit.ups, each) for each in cameras]
 
     step = 0.05
-    times = np.arange(-MAX_OFFSET, MAX_OFFSET + step / 2, step)
+    times = np.arange(-limit, limit + step / 2, step)
     costs = misfits(*times)
     lowest = int(np.clip(np.argmin(costs), 1, len(times) - 2))
     low, middle, high = costs[lowest - 1 : lowest + 2]
     curvature = max((low - 2 * middle + high) / step**2, 1e-9)
-    late = float(np.clip(times[lowest] - (high - low) / (2 * step) / curvature, -MAX_OFFSET, MAX_OFFSET))
+    late = float(np.clip(times[lowest] - (high - low) / (2 * step) / curvature, -limit, limit))
     misfit_best, misfit_sound = misfits(late, 0.0)
-    gained = misfit_sound - misfit_best
+    left = sound.misfit * misfit_best / max(misfit_sound, 1e-9)
     fault = f"the tilt's stamps are {abs(late) * 1000:.0f} ms {'late' if late > 0 else 'early'}"
     remedy = (
         f"Set source.time_offset.inclinometer to {-late * 1000:.0f} ms, plus its present value, or correct the clocks "
         "or the driver."
     )
     return Cause(
-        fault, remedy, max(sound.misfit - gained, misfit_best), sound.ground, 1, abs(late) / MIN_OFFSET,
+        fault, remedy, left, sound.ground, 1, abs(late) / MIN_OFFSET,
         float(np.sqrt(2 / curvature)) / MIN_OFFSET,
     )  # fmt: skip
 
 
-def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
+def _splines(evidence: Evidence, margin: float) -> tuple[Array, dict[int, RotationSpline]]:
     """The camera's rotation over time, s, for each stretch of rising stamps without long gaps; and the stretch of each
-    frame, -1 within `MAX_OFFSET` of its ends."""
+    frame, -1 within `margin` s of its ends."""
     from scipy.spatial.transform import Rotation, RotationSpline  # takes long to import
 
     seconds = (evidence.stamps - evidence.stamps[0]) / 1e9
@@ -251,7 +251,7 @@ def _splines(evidence: Evidence) -> tuple[Array, dict[int, RotationSpline]]:
         if len(times) < 4:
             continue
         splines[int(stretch)] = RotationSpline(times, Rotation.from_matrix(evidence.cameras[inside]))
-        within[inside & (seconds - MAX_OFFSET >= times[0]) & (seconds + MAX_OFFSET <= times[-1])] = stretch
+        within[inside & (seconds - margin >= times[0]) & (seconds + margin <= times[-1])] = stretch
     return within, splines
 
 

@@ -15,6 +15,8 @@ import numpy as np
 from stages.data.rotations import angle_of
 from stages.localisation.tilt.causes import (
     GROUND_SIGMA,
+    MAX_LARGE_OFFSET,
+    MAX_OFFSET,
     MIN_FRAMES,
     Cause,
     Evidence,
@@ -29,6 +31,7 @@ from stages.localisation.tilt.causes import (
 NOISE = float(np.deg2rad(0.2))  # rad, prior for a tilt, against which the camera's drift is weighed
 MIN_NOISE = float(np.deg2rad(0.05))  # rad
 MAX_NOISE = float(np.deg2rad(2.0))  # rad; beyond it tilt and camera disagree, whatever the best explanation
+MAX_SOUND_NOISE = float(np.deg2rad(0.5))  # rad; beyond it large time offsets are tried
 MAX_SLOPE = float(np.deg2rad(20))  # rad; ground that is steeper in every frame means a wrong tilt
 MIN_GAIN = 25.0  # of a fault's score over that of no fault: five sigma
 MIN_RIVAL_GAIN = 10.0  # over the scores of other faults; those within it are named too
@@ -97,8 +100,11 @@ def _judged(evidence: Evidence, degrees_of_freedom: int, noise: float) -> tuple[
     sound = fit.cause("", "", fit.ups)
     tried = _Hypotheses(
         len(evidence.stamps), degrees_of_freedom, noise, sound, exchanged_axes(fit), wrong_mount(fit),
-        late_stamps(fit, sound), radians_as_degrees(fit),
+        late_stamps(fit, sound, MAX_OFFSET), radians_as_degrees(fit),
     )  # fmt: skip
+    if tried.residual(sound) > MAX_SOUND_NOISE:
+        offsets = [cause for cause in (tried.offset, late_stamps(fit, sound, MAX_LARGE_OFFSET)) if cause is not None]
+        tried = tried._replace(offset=min(offsets, key=lambda cause: cause.misfit, default=None))
     variance = tried.variance
     best = min(tried.faults, key=lambda cause: cause.score(variance))
     resulting_noise = noise * float(np.sqrt(variance))

@@ -83,13 +83,13 @@ def test_a_camera_that_hangs_upside_down_is_a_wrong_mount(drive):
 
 
 @pytest.mark.parametrize("drive", DRIVES)
-@pytest.mark.parametrize("late", [0.2, -0.2])
+@pytest.mark.parametrize("late", [0.2, -0.2, 1.7, -2.5])
 def test_a_time_offset_is_named_with_its_size(drive, late):
     found = diagnose(drive.evidence(late=late))
     size = re.fullmatch(r"the tilt's stamps are (\d+) ms (late|early)", found.fault)
     assert size is not None, found.sentence
     assert size[2] == ("late" if late > 0 else "early")
-    assert abs(int(size[1]) - 200) < 50
+    assert abs(int(size[1]) - 1000 * abs(late)) < 50
     assert f"Set source.time_offset.inclinometer to {'-' if late > 0 else ''}{size[1]} ms" in found.sentence
 
 
