@@ -35,6 +35,27 @@ def frame():
     return StereoFrame(1, *simulation.frame(0).images, simulation.camera)
 
 
+def test_cameras_that_hang_upside_down_are_the_warning():
+    simulation = Simulation(frames=1, width=320, height=240, relief_cells=512, seed=2, abundance=0.1)
+    upright = simulation.frame(0).images
+    for images, words in ((upright, None), ([image[::-1, ::-1].copy() for image in upright[::-1]], "hang upside down")):
+        check = Running(CheckMatches())
+        frame = StereoFrame(1, *images, simulation.camera)
+        check(stereo_part("rover", frame, 48, entry="rectified")["disparity"])
+        found = check.finding()
+        assert (found is None) == (words is None)
+        assert words is None or words in found.sentence
+
+
+def test_matches_beyond_the_search_range_of_opencv_do_not_count(frame):
+    for disparities, warned in ((64, False), (32, True), (16, True)):
+        check = Running(CheckMatches())
+        check(stereo_part("paper", frame, disparities, entry="rectified")["matched"])
+        found = check.finding()
+        assert (found is not None) == warned
+        assert found is None or "increase `disparities`" in found.sentence
+
+
 @pytest.mark.parametrize("pipeline", ["rover", "fast", *slow("accurate")])
 def test_only_a_search_range_that_ends_short_of_the_ground_is_a_warning(frame, pipeline):
     for disparities, words in ((48, None), (16, None), (8, "increase `disparities`")):
