@@ -80,7 +80,8 @@ class Binarise(Stage):
         window = _shown(elevation)
         reason = np.full(elevation.shape, CellReason.UNOBSERVED, np.uint8)
         within = {name: layer[window] for name, layer in elevation.layers.items()}
-        reason[window] = self._reasons(replace(elevation, layers=within))
+        if reason.size:  # OpenCV refuses empty masks
+            reason[window] = self._reasons(replace(elevation, layers=within))
         cells = np.full(elevation.shape, Cell.UNKNOWN, np.int8)
         cells[window] = STATE_OF[reason[window]]
         return NavigationMap(elevation.stamp, cells, reason, elevation.resolution, elevation.origin, elevation.frame_id)

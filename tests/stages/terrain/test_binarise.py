@@ -66,6 +66,10 @@ def test_every_rock_on_any_ground_is_found_with_few_false_alarms(ground):
     assert alarms <= 0.002
 
 
+def test_a_map_without_cells_stays_one():
+    assert decided(map_of(np.zeros((0, 5)))).cells.shape == (0, 5)
+
+
 @given(degrees=st.floats(0, 19.9), heading=st.floats(0, 2 * np.pi), offset=st.floats(-50, 50))
 def test_a_plane_within_the_slope_limit_is_free_where_it_was_seen(degrees, heading, offset):
     z = offset + np.tan(np.deg2rad(degrees)) * (np.cos(heading) * X + np.sin(heading) * Y)
