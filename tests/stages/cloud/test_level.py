@@ -96,6 +96,7 @@ FILLED = replace(CLOUD, source=np.full(len(POINTS), PixelOrigin.FILLED, np.uint8
 
 @pytest.mark.parametrize(("cloud", "up", "message"), [
     (CLOUD, [0, 0, -1.0], "nearly vertical"),
+    (CLOUD, [0, -0.08, -np.sqrt(1 - 0.08**2)], "nearly vertical"),
     (Level()(CLOUD, Tilt(0, UP), BARE), UP, "only once"),
     (cloud_of(np.zeros((0, 3))), UP, "the frame has no measured point within range"),
     (FILLED, UP, "the frame has no measured point within range"),

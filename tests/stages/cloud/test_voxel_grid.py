@@ -30,8 +30,11 @@ def test_every_measured_point_in_range_is_in_exactly_one_voxel():
     cloud = some(1)
     filled = np.arange(len(cloud.points)) % 4 == 0
     source = np.where(filled, PixelOrigin.FILLED, PixelOrigin.MEASURED).astype(np.uint8)
-    voxels = VoxelGrid(max_range=0.6, resolution=0.1)(replace(cloud, source=source))
-    inside = ~filled & (np.hypot(cloud.points[:, 0], cloud.points[:, 1]) <= 0.6)
+    points = cloud.points.copy()
+    points[1::40, 2] = np.nan
+    cloud = replace(cloud, points=points, source=source)
+    voxels = VoxelGrid(max_range=0.6, resolution=0.1)(cloud)
+    inside = ~filled & np.isfinite(points[:, 2]) & (np.hypot(cloud.points[:, 0], cloud.points[:, 1]) <= 0.6)
     assert voxels.count.sum() == inside.sum()
     cubes = {tuple(cube) for cube in np.floor(cloud.points[inside] / np.float64(0.1)).astype(int)}
     assert sorted(map(tuple, voxels.index)) == sorted(cubes)

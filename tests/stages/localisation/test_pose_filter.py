@@ -12,6 +12,7 @@ from recordings.simulator.traverse import level_pose
 from stages import Mount, Pose, PoseFilter, Tilt, Transform
 from stages.data import Array
 from stages.localisation.pose_check import PoseCheck
+from stages.localisation.pose_filter import SCALE_ERROR, _common_errors
 from tests.stages.localisation.drive import FRAMES, Drive, motions, readings
 from tests.stages.running import Running
 
@@ -174,6 +175,41 @@ def test_a_logged_pose_that_disagrees_with_the_images_is_a_warning(change, sente
 def test_a_jump_is_long_and_ten_times_the_usual_difference(usual, longest, jumps):
     steps = [np.array([1.0, 1.0, difference]) for difference in [usual] * 10 + [longest]]
     assert ("jumps 1 time" in PoseCheck(steps=steps).problem()) == jumps
+
+
+@pytest.mark.parametrize(("steps", "problem"), [
+    ([(1.0, 0.2, 0.8)] * 4, ""),
+    ([(1.0, 0.2, 0.8)] * 5, "disagrees with visual odometry"),
+    ([(1.1, 1.0, 0.1)] * 9, ""),
+    ([(1.1, 1.0, 0.1)] * 10, "10 % longer"),
+    ([(0.019, 0.0, 0.019)] * 10, ""),  # noise of a rover that stands
+])  # fmt: skip
+def test_few_and_short_steps_are_not_judged(steps, problem):
+    found = PoseCheck(steps=[np.array(step) for step in steps]).problem()
+    assert problem in found
+    assert bool(found) == bool(problem)
+
+
+def test_no_step_leads_over_lost_tracking():
+    check, camera = PoseCheck(), FIRST.camera
+    far = replace(camera, translation=camera.translation + 9.0)
+    lost = replace(FIRST, camera=None)
+    for motion in (FIRST, lost, replace(FIRST, camera=far), replace(FIRST, segment=2), replace(FIRST, segment=2)):
+        check.add(motion, LOGGED, MOUNT)
+    np.testing.assert_array_equal(check.steps, np.zeros((1, 3)))
+
+
+def test_the_error_of_all_steps_is_half_as_large_sideways():
+    errors = _common_errors(np.array([10.0, 0.0, 0.0]), 0.0, 0.0)
+    along = 10 * SCALE_ERROR
+    np.testing.assert_allclose(np.linalg.norm(errors, axis=0), [along, along / 2, 0, 0, 0, 0])
+
+
+def test_an_exact_tilt_and_an_exact_motion_give_poses():
+    stage = Running(PoseFilter())
+    exact = replace(UPRIGHT, sigma=0.0)
+    poses = [stage(replace(FIRST, covariance=np.zeros((6, 6))), exact, MOUNT) for _ in range(3)]
+    assert np.isfinite([pose.covariance for pose in poses]).all()
 
 
 def test_without_base_link_the_pose_is_that_of_the_camera():

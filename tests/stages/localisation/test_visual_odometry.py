@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import Halve, PixelOrigin, StereoCamera, StereoFrame, Transform, VisualOdometry
-from stages.localisation.visual_odometry import MIN_FEATURES
-from stages.localisation.vo_tracking import vo_frame
+from stages.localisation.visual_odometry import MIN_FEATURES, _plausible
+from stages.localisation.vo_tracking import MAX_DEPTH, Step, vo_frame
 from tests.stages.builders import disparity_of
 from tests.stages.running import Running
 
@@ -148,3 +148,26 @@ def test_features_with_a_filled_disparity_do_not_count(drive):
     frame, disparity = drive[0]
     _, (motion,) = tracked((frame, disparity_of(disparity.pixels, PixelOrigin.FILLED, stamp=frame.stamp)))
     assert motion.lost == "only 0 features have a disparity (minimum 40)"
+
+
+def test_points_are_by_the_offset_of_the_principal_points_and_near(drive):
+    frame, disparity = drive[0]
+    shifted = replace(frame, camera=replace(frame.camera, cx_right=frame.camera.cx + 2.0))
+    less = replace(disparity, pixels=disparity.pixels - 2)
+    plainly = replace(frame, camera=replace(frame.camera, cx_right=frame.camera.cx))
+    plain, moved = vo_frame(plainly, disparity).points, vo_frame(shifted, less).points
+    np.testing.assert_allclose(plain, moved, rtol=1e-4)
+    assert np.nanmax(vo_frame(plainly, replace(disparity, pixels=disparity.pixels / 8)).points[:, 2]) <= MAX_DEPTH
+
+
+def test_a_resumed_run_continues_with_the_number_of_the_segment(drive):
+    odometry = VisualOdometry()
+    assert odometry(*drive[0], state=odometry.resumed(3)).segment == 3
+
+
+@pytest.mark.parametrize(("rms", "metres", "plausible"), [
+    (1.9, 4.9, True), (2.1, 1.0, False), (1.0, 5.1, False),
+])  # fmt: skip
+def test_a_motion_that_is_long_or_rough_is_not_plausible(rms, metres, plausible):
+    step = Step(np.eye(3), np.array([0.0, 0.0, metres]), 100, rms, 1.0, np.eye(6))
+    assert _plausible(step) == plausible

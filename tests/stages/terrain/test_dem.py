@@ -120,6 +120,13 @@ def test_cells_of_filled_pixels_have_the_cause_of_the_failed_match():
     assert np.isfinite(cells.layers["unmatched"]).sum() == 4
 
 
+@pytest.mark.parametrize(("pixels", "cause"), [(3, MatchFailure.OTHER), (4, MatchFailure.BARE)])
+def test_few_pixels_of_one_shade_are_not_bare(pixels, cause):
+    cloud = cloud_of(np.tile([2.02, 0.01, 0.0], (pixels, 1)), colors=np.full((pixels, 3), 120, np.uint8))
+    cells = Voxelise()(replace(cloud, source=np.full(pixels, PixelOrigin.FILLED, np.uint8)))
+    assert cells.layers["unmatched"][160, 200] == cause
+
+
 def test_cells_behind_a_rock_are_occluded_and_cells_out_of_view_are_not():
     cloud = Clean()(Reproject()(FRAME, as_disparity(rocks_seen([(4.0, 0.0, 0.4)]))))
     grid = Voxelise()(Level(camera_height=HEIGHT)(cloud, TILT))

@@ -66,3 +66,9 @@ def test_a_covariance_that_states_nothing_gives_finite_planes(stated):
     _, planes = driven([pose(0.3 * step, covariance=stated) for step in range(10)], noisy_ups(10), np.zeros((10, 2)))
     assert np.isfinite(planes).all()
     assert np.abs(planes).max() < 0.05
+
+
+def test_a_pose_whose_covariance_grows_may_have_moved_that_far():
+    before = MapLevelling.begin(pose(0, covariance=1e-4 * np.eye(6)), STATED)
+    grown = before.moved(pose(0, covariance=5e-4 * np.eye(6)), STATED)
+    assert grown.covariance[0, 0] == pytest.approx(4e-4, rel=0.01)
