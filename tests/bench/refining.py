@@ -20,6 +20,8 @@ import cv2
 import numpy as np
 
 from flow.config.loader import load
+from flow.runtime.evaluate import evaluate
+from flow.runtime.graph import Graph
 from flow.runtime.malloc import keep_freed_memory
 from stages import Disparity, StereoFrame
 from stages.data import Array
@@ -51,32 +53,26 @@ def stereo_part(
     disparities: the range at full size; a coarser one keeps its share of it; changes: parameters of every stage that
     has them; given: streams that are not made but taken as they are.
     """
-    streams: dict[str, Any] = {entry: frame, **given}
-    for node in _needed(pipeline, frozenset(streams)):
+    graph, nodes = _loaded(pipeline), []
+    for node in graph.nodes:
         actor, names = node.actor, {field.name for field in fields(node.actor)}
         if "disparities" in names:
             actor = replace(actor, disparities=round(actor.disparities * disparities / DISPARITIES))
         changed = {"threads": threads, **changes}
         actor = replace(actor, **{name: value for name, value in changed.items() if name in names})
-        streams[node.name] = actor(**{port: streams[name] for port, name in node.inputs.items()})
-    return streams
+        nodes.append(replace(node, actor=actor))
+    return evaluate(replace(graph, nodes=tuple(nodes)), {entry: frame, **given}, "disparity")
 
 
 @functools.cache
-def _needed(pipeline: str, given: frozenset[str]) -> tuple[Any, ...]:
-    """The nodes that the disparity depends on where some streams are given, in the order of their work."""
-    wanted, needed = {"disparity"} - given, []
-    for node in reversed(load(pipeline).nodes):
-        if node.name in wanted:
-            needed.append(node)
-            wanted |= set(node.inputs.values()) - given
-    return tuple(reversed(needed))
+def _loaded(pipeline: str) -> Graph:
+    return load(pipeline)
 
 
 @functools.cache
 def stage(pipeline: str, name: str) -> Any:
     """The stage that makes a stream of a pipeline."""
-    return next(node.actor for node in load(pipeline).nodes if node.name == name)
+    return next(node.actor for node in _loaded(pipeline).nodes if node.name == name)
 
 
 def scenes(folder: Path) -> Iterator[tuple[str, StereoFrame, Array, Array, int]]:

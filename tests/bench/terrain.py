@@ -28,6 +28,8 @@ from scipy.spatial.transform import Rotation
 from flow.align import Token
 from flow.cli import arguments
 from flow.config.loader import load
+from flow.runtime.evaluate import needed
+from flow.runtime.graph import Graph
 from flow.runtime.malloc import keep_freed_memory
 from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
@@ -93,7 +95,7 @@ def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     for sample in range(max(number - WINDOW, 0), number + TILT_SAMPLES + 1):
         at = simulation.begin + round(sample / TILT_RATE * 1e9)
         samples.append(Token(at, noise(Tilt(at, measured_up(simulation, sample, at)))))
-    aligner = next(node.actor for node in nodes(pipeline) if node.name == "tilt")
+    aligner = next(node.actor for node in graph_of(pipeline).nodes if node.name == "tilt")
     tilt = aligner.choose("tilt", "inclinometer", stamp, samples, " by the log's end")
     assert isinstance(tilt, Tilt), tilt
     return tilt
@@ -140,20 +142,15 @@ def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dispa
 
 
 @cache
-def nodes(pipeline: str) -> list[Any]:
-    """The stages and aligners of a pipeline, each after those it needs."""
-    return list(load(pipeline).nodes)
+def graph_of(pipeline: str) -> Graph:
+    """A pipeline, loaded once."""
+    return load(pipeline)
 
 
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:
     """The further streams up to a frame's navigation map, and the processor seconds of terrain stages."""
-    wanted, steps = {"navigation_map"}, []
-    for node in reversed(nodes(pipeline)):
-        if node.name in wanted and node.name not in streams:
-            wanted.update(node.inputs.values())
-            steps.append(node)
-    streams, seconds = dict(streams), 0.0
-    for node in reversed(steps):
+    steps, streams, seconds = needed(graph_of(pipeline), streams, "navigation_map"), dict(streams), 0.0
+    for node in steps:
         start = time.thread_time()
         streams[node.name] = node.actor(**{port: streams[stream] for port, stream in node.inputs.items()})
         seconds += (time.thread_time() - start) * (node.name in TERRAIN_STREAMS)

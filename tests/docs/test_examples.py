@@ -14,7 +14,7 @@ import pytest
 
 from flow.contracts import Severity, StageError
 from recordings.simulator import Simulation
-from stages import Disparity, ElevationMap, NavigationMap, PixelOrigin, StereoFrame, known
+from stages import Cell, Disparity, ElevationMap, NavigationMap, PixelOrigin, StereoFrame, Tilt, known
 from tests.docs import pages
 
 
@@ -105,20 +105,22 @@ def test_flow_runs_without_a_rover(tmp_path):
     assert (tmp_path / "numbers.txt").read_text() == shown
 
 
-def test_a_template_runs_on_frames_in_memory(tmp_path, monkeypatch):
-    save("docs/pipelines.md", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
+def test_a_pipeline_is_evaluated_in_a_notebook():
     simulation = Simulation(width=320, height=240, relief_cells=512)
     camera, rendered = simulation.camera, simulation.frame(0)
     truth = camera.fx * camera.baseline / rendered.depth
-    code = next(block.text for block in pages.blocks("python") if "from in_memory import Frames" in block.text)
-    names: dict[str, Any] = {"frame": StereoFrame(7, *rendered.images, camera)}
+    code = next(block.text for block in pages.blocks("python") if "import evaluate" in block.text)
+    names: dict[str, Any] = {
+        "frame": StereoFrame(7, *rendered.images, camera),
+        "tilt": Tilt(7, [0.0, -np.cos(0.26), -np.sin(0.26)], camera.frame_id),
+    }
     exec(code, names)
-    (kept,) = names["kept"]
-    assert (names["summary"]["verdict"], kept.stamp) == ("COMPLETE", 7)
-    measured = kept.source == PixelOrigin.MEASURED
-    assert np.median(np.abs(kept.pixels - truth)[measured] / kept.sigma[measured]) < 1
+    found = names["streams"]["disparity"]
+    measured = found.source == PixelOrigin.MEASURED
+    assert np.median(np.abs(found.pixels - truth)[measured] / found.sigma[measured]) < 1
+    navigation = names["streams"]["navigation_map"]
+    assert navigation.stamp == 7
+    assert np.count_nonzero(navigation.cells == Cell.FREE) > 2000
 
 
 def test_the_stage_with_state_starts_each_run_empty(written):

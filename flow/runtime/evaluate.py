@@ -1,0 +1,78 @@
+"""Evaluates streams of a pipeline on one frame in memory, as in a notebook: without a log and without threads."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+from flow.contracts import nearest
+from flow.errors import UsageError
+from flow.runtime.graph import Graph, Node, ports_of
+
+
+def evaluate(
+    graph: Graph, given: Mapping[str, Any], wanted: str, states: dict[str, Any] | None = None
+) -> dict[str, Any]:
+    """The streams from those given up to the wanted one, by name, for one frame; without those that have nothing new.
+
+    Parameters
+    ----------
+    graph
+        A pipeline, as `flow.config.loader.load` returns it.
+    given
+        Stream -> item, such as {"rectified": frame}. These streams are not made.
+    wanted
+        The stream to make. Inputs that a stage can do without are left out where they are not given.
+    states
+        Stream -> state of its stage. One dict for all frames continues with each; by default states are new.
+
+    Raises
+    ------
+    UsageError
+        If the pipeline lacks one of these streams, or if another one must be given, as of an aligner.
+
+    Examples
+    --------
+    >>> from flow.config.loader import load
+    >>> from flow.runtime.evaluate import evaluate
+    >>> streams = evaluate(load("rover"), {"rectified": frame}, "disparity")  # doctest: +SKIP
+    >>> streams["disparity"].sigma.shape  # doctest: +SKIP
+    (960, 1280)
+    """
+    plan, lacking = dict[str, tuple[Node, dict[str, str]]](), dict[str, str]()  # lacking: stream -> the one to give
+    for node in needed(graph, given, wanted):
+        inputs = {port: stream for port, stream in node.inputs.items() if stream in given or stream in plan}
+        absent = node.inputs.keys() - inputs.keys() - ports_of(type(node.actor))[1]
+        if node.aligns:
+            lacking[node.name] = node.name
+        elif absent:
+            lacking[node.name] = lacking[node.inputs[min(absent)]]
+        else:
+            plan[node.name] = node, inputs
+    if wanted not in {*given, *plan}:
+        missing = lacking.get(wanted, wanted)
+        raise UsageError(f"'{wanted}' needs a stream that only a run makes from a log; give '{missing}'")
+    streams, states = dict(given), {} if states is None else states
+    for name, (node, inputs) in plan.items():
+        if streams.keys() >= {*inputs.values()}:
+            state = {"state": states.setdefault(name, node.actor.start())} if node.stateful else {}
+            item = node.actor(**{port: streams[stream] for port, stream in inputs.items()}, **state)
+            streams |= {} if item is None else {name: item}
+    return streams
+
+
+def needed(graph: Graph, given: Collection[str], wanted: str) -> tuple[Node, ...]:
+    """The nodes that make a stream where others are given, each after those that it needs, but for those of aligners.
+
+    Raises UsageError if the pipeline lacks one of these streams.
+    """
+    known = [*graph.source_streams, *(node.name for node in graph.nodes)]
+    for name in (wanted, *given):
+        if name not in known:
+            raise UsageError(f"the pipeline has no stream '{name}'{nearest(name, known)}")
+    names, found = {wanted} - {*given}, list[Node]()
+    for node in reversed(graph.nodes):  # every node comes after its inputs
+        if node.name in names:
+            found.append(node)
+            names |= set() if node.aligns else {*node.inputs.values()} - {*given}
+    return tuple(reversed(found))

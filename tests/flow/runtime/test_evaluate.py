@@ -1,0 +1,55 @@
+"""Streams of a pipeline are evaluated in memory: those given are not made, those not needed are not made either."""
+
+import pytest
+
+from flow.config.loader import load
+from flow.errors import UsageError
+from flow.runtime.evaluate import evaluate
+from tests.flow.toys import Couple, Number, graph
+
+GIVEN = {"both": Couple(7, 5.0)}
+OPEN = """
+source: {use: tests.flow.toys.Source}
+streams:
+  both:   {use: flow.align.pair, left: left, right: right}
+  height: {use: flow.align.interpolate, stream: level, at: both}
+  either: {use: tests.flow.toys.Either, a: both, b: height}
+sinks: [{use: tests.flow.toys.Keep}]
+"""
+
+
+def test_only_streams_between_those_given_and_the_wanted_one_are_made(tmp_path):
+    toys = graph(tmp_path)
+    assert evaluate(toys, GIVEN, "sum") == GIVEN | {
+        "twice": Couple(7, 10.0), "thrice": Couple(7, 15.0), "sum": Couple(7, 25.0),
+    }  # fmt: skip
+    found = evaluate(toys, {"sum": Couple(7, 1.0), "height": Number(7, 2.0)}, "raised")
+    assert found == {"sum": Couple(7, 1.0), "height": Number(7, 2.0), "raised": Couple(7, 3.0)}
+    assert evaluate(toys, GIVEN, "both") == GIVEN
+
+
+def test_a_state_continues_only_where_it_is_kept(tmp_path):
+    toys, states = graph(tmp_path), {}
+    assert [evaluate(toys, GIVEN, "total", states)["total"].value for _ in range(3)] == [10, 20, 30]
+    assert states == {"total": [10, 10, 10]}
+    assert [evaluate(toys, GIVEN, "total")["total"].value for _ in range(2)] == [10, 10]
+
+
+def test_an_input_that_a_stage_can_do_without_may_be_left_out(tmp_path):
+    (tmp_path / "open.yaml").write_text(OPEN)
+    toys = load(str(tmp_path / "open.yaml"))
+    assert evaluate(toys, GIVEN, "either")["either"] == Couple(7, 5.0)
+    assert evaluate(toys, GIVEN | {"height": Number(7, 1.0)}, "either")["either"] == Couple(7, 6.0)
+
+
+@pytest.mark.parametrize(("given", "wanted", "sentence"), [
+    (GIVEN, "summ", "the pipeline has no stream 'summ'; did you mean 'sum'?"),
+    ({"bth": Couple(7, 5.0)}, "sum", "the pipeline has no stream 'bth'; did you mean 'both'?"),
+    ({"sum": Couple(7, 1.0)}, "raised", "'raised' needs a stream that only a run makes from a log; give 'height'"),
+    ({}, "raised", "'raised' needs a stream that only a run makes from a log; give 'both'"),
+    ({}, "left", "'left' needs a stream that only a run makes from a log; give 'left'"),
+])  # fmt: skip
+def test_what_cannot_be_made_is_refused_in_one_sentence(tmp_path, given, wanted, sentence):
+    with pytest.raises(UsageError) as raised:
+        evaluate(graph(tmp_path), given, wanted)
+    assert str(raised.value) == sentence
