@@ -42,11 +42,11 @@ def evaluate(
     plan, lacking = dict[str, tuple[Node, dict[str, str]]](), dict[str, str]()  # lacking: stream -> the one to give
     for node in needed(graph, given, wanted):
         inputs = {port: stream for port, stream in node.inputs.items() if stream in given or stream in plan}
-        absent = node.inputs.keys() - inputs.keys() - ports_of(type(node.actor))[1]
+        absent = node.inputs.keys() - inputs.keys()
         if node.aligns:
             lacking[node.name] = node.name
-        elif absent:
-            lacking[node.name] = lacking[node.inputs[min(absent)]]
+        elif required := absent and absent - ports_of(type(node.actor))[1]:
+            lacking[node.name] = lacking[node.inputs[min(required)]]
         else:
             plan[node.name] = node, inputs
     if wanted not in {*given, *plan}:
