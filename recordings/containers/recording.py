@@ -126,7 +126,8 @@ class Recording:
     path: what the user gave, the file or the folder; files: in the order in which they were recorded; missing:
     sentences about files that are not there, whose messages are lost; part: a sentence if the path is only one of
     several files of a recording; on_close: closes the files. channels: of all files by number, a topic may have
-    several; start, end: log time of the first and the last message, ns.
+    several; stamped: those whose messages begin with a header; start, end: log time of the first and the last
+    message, ns.
     """
 
     def __init__(
@@ -141,7 +142,7 @@ class Recording:
         self._on_close = on_close
         self.size = sum(file.size for file in files)
         self.channels, self._numbers = _merged_channels(files)
-        self._stamped = {number for number, channel in self.channels.items() if begins_with_header(channel)}
+        self.stamped = {number for number, channel in self.channels.items() if begins_with_header(channel)}
         try:
             self.start = min(part.ends[0] for part in self._parts)
             self.end = max(part.ends[1] for part in self._parts)
@@ -195,7 +196,7 @@ class Recording:
         """
         seen = defaultdict[str, deque[tuple[int, int]]](lambda: deque(maxlen=_MAX_REMEMBERED))
         for item in self._merged(channels, start, end, allow_repeats):
-            if isinstance(item, RawMessage) and item.channel in self._stamped:
+            if isinstance(item, RawMessage) and item.channel in self.stamped:
                 channel = self.channels[item.channel]
                 if stamp := peek_stamp(item.data, channel.message_encoding):
                     known, this = seen[channel.topic], (stamp, crc32(item.data))
@@ -230,7 +231,7 @@ class Recording:
 
         Messages that do not begin with a header are read as a whole.
         """
-        if not channels <= self._stamped:
+        if not channels <= self.stamped:
             yield from self.messages(channels)
             return
         for file, numbers in zip(self.files, self._numbers, strict=True):
@@ -293,7 +294,7 @@ class Recording:
             return _stamp_at(self.files[number], place - firsts[number])
 
         if len(self.files) == 1:
-            return clock_steps(timelines[0], self._stamped, stamp_at)
+            return clock_steps(timelines[0], self.stamped, stamp_at)
         channels = list[NDArray[np.int32]]()
         for numbers, timeline in zip(self._numbers, timelines, strict=True):
             merged_of = np.full(np.max(timeline.channels, initial=0) + 1, -1, np.int32)  # -1: of no known channel
@@ -301,7 +302,7 @@ class Recording:
                 merged_of[own : own + 1] = number
             channels.append(merged_of[timeline.channels])
         merged = Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
-        return clock_steps(merged, self._stamped, stamp_at)
+        return clock_steps(merged, self.stamped, stamp_at)
 
 
 def _stamp_at(file: Container, place: int) -> int:

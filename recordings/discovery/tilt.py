@@ -45,6 +45,8 @@ def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedT
             found.remedies["inclinometer"] = _meanings(topic.name)
         else:
             found.chosen["inclinometer"], found.why["inclinometer"] = given, "as set"
+            if settings.roll is not None and settings.roll.topic not in (None, given):
+                found.why["inclinometer"] += f"; rolls are on {settings.roll.topic}"
             if topic.schema == IMU and found.tilt == TiltKind.ORIENTATION:
                 content = imu_content(messages, given)
                 if content.no_orientation and content.accelerations:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Literal
@@ -237,7 +237,8 @@ class JoinedAngles:
         if found is None or (stamp := _stamp_of(*found)) < begin:
             return None
         pitch = after if stamp == end else before + (after - before) * (stamp - begin) / (end - begin)
-        return _tilt(*found, up_of(pitch, self._angles.roll(found[0]), self._angles.model))
+        tilt = _tilt(*found, up_of(pitch, self._angles.roll(found[0]), self._angles.model))
+        return tilt if frame_of(found[0]) else replace(tilt, frame_id=frame_of(message) or tilt.frame_id)
 
 
 def up_of(pitch: float, roll: float, model: Literal["axis", "euler"]) -> Array:

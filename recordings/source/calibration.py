@@ -137,8 +137,8 @@ def baseline_fault(baseline: float, height: float) -> Finding | None:
 
     A height of 0 or less is that of no ground.
 
-    >>> baseline_fault(0.24, 0.9) is baseline_fault(0.24, 0.0) is baseline_fault(0.0008, 0.02) is None
-    True
+    >>> [baseline_fault(*each) for each in ((0.24, 0.9), (0.24, 0.0), (0.24, 0.02), (0.0008, 0.02))]
+    [None, None, None, None]
     """
     low = height if height > 0 else ASSUMED_HEIGHT
     if MIN_BASELINE * low <= baseline <= MAX_BASELINE * max(low, ASSUMED_HEIGHT):

@@ -112,6 +112,8 @@ class LogSettings:
             raise ValueError(
                 "McapSource needs 'pitch.topic' and 'roll.topic', or neither if one message has both angles"
             )
+        if self.pitch.topic is not None and self.inclinometer not in (None, self.pitch.topic):  # type: ignore[union-attr]
+            raise ValueError("McapSource needs either 'inclinometer', or 'pitch.topic' and 'roll.topic'")
         model: Any = self.tilt_model
         return BareAngles(self.pitch, self.roll, model)  # type: ignore[arg-type]  # none of them is None
 

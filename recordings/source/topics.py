@@ -126,9 +126,10 @@ class DecodedTopics:
 
     def stamp_of(self, raw: RawMessage) -> int:
         """The header stamp of a message, ns; 0 if there is none."""
-        encoding = self.file.channels[raw.channel].message_encoding
-        if encoding in ("cdr", "ros1"):
-            return peek_stamp(raw.data, encoding)
+        channel = self.file.channels[raw.channel]
+        if channel.message_encoding in ("cdr", "ros1"):
+            stamped = raw.channel in self.file.stamped or self.schemas.get(channel.topic) in STAMPED_SCHEMAS
+            return peek_stamp(raw.data, channel.message_encoding) if stamped else 0
         stamp = attempt(lambda: stamp_of(self.decoders[raw.channel](raw.data).header))
         return 0 if isinstance(stamp, LogError) else stamp
 
