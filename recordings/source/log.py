@@ -194,7 +194,7 @@ class McapLog:
             is_inside = not part.edges or (
                 frames.has(reader.stream, self.stamp_of(raw, reader.stream), raw.log_time)
                 if reader.stream in CAMERAS
-                else near.has(0, raw.log_time)
+                else near.has(self.stamp_of(raw, reader.stream), raw.log_time)
             )
             if not is_inside:
                 if reader.video is not None:  # later images need it

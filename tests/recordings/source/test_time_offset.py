@@ -5,10 +5,13 @@ import pytest
 from recordings import McapSource
 from recordings.inventory.description import describe
 from recordings.inventory.text import format_description
+from recordings.mcap.writer import Ros2Writer
+from recordings.ros2.to_msg import imu
 from recordings.source.settings import TimeOffsets
 from tests.recordings.sample_log import (
     PERIOD,
     RIGHT,
+    START,
     TILT,
     UNSTAMPED,
     Edit,
@@ -19,6 +22,7 @@ from tests.recordings.sample_log import (
     inventory_of,
     items_of,
     losses_in,
+    tilt_quaternion,
     write_sample,
 )  # fmt: skip
 
@@ -58,6 +62,20 @@ def test_a_range_has_both_images_of_a_frame_by_corrected_stamps(tmp_path):
     left, right = ([item.stamp for _, stream, item in events if stream == side] for side in ("left", "right"))
     assert left == right
     assert len(left) == 2
+
+
+@pytest.mark.parametrize("logged_late", [0, 2_000_000_000])
+def test_a_range_has_the_tilts_around_it_by_corrected_stamps(tmp_path, logged_late):
+    images, tilts = write_sample(tmp_path / "images.mcap", dropped(TILT)), tmp_path / "tilts.mcap"
+    late, first = 2_000_000_000, START - 5_000_000_000
+    with Ros2Writer(tilts) as writer:
+        for time in range(first, START + 5_000_000_000, PERIOD):
+            writer.write(TILT, imu(time + late, "imu_link", tilt_quaternion(0)), time + logged_late)
+    source = McapSource(time_offset=TimeOffsets(inclinometer=-late))
+    start = 5.1 - logged_late / 1e9
+    events = items_of([images, tilts], source, start=start, end=start + 0.2)
+    inside = {stamp - START for stamp in stamps_of(events)}
+    assert inside == {*range(-900_000_000, 1_300_000_000, PERIOD)}
 
 
 def test_info_counts_pairs_and_tilts_by_corrected_stamps(tmp_path):
