@@ -1,5 +1,7 @@
 """Streams of a pipeline are evaluated in memory: those given are not made, those not needed are not made either."""
 
+from dataclasses import dataclass, replace
+
 import pytest
 
 from flow.config.loader import load
@@ -40,6 +42,18 @@ def test_an_input_that_a_stage_can_do_without_may_be_left_out(tmp_path):
     toys = load(str(tmp_path / "open.yaml"))
     assert evaluate(toys, GIVEN, "either")["either"] == Couple(7, 5.0)
     assert evaluate(toys, GIVEN | {"height": Number(7, 1.0)}, "either")["either"] == Couple(7, 6.0)
+
+
+@dataclass(frozen=True)
+class Silent:
+    def __call__(self, couple: Couple) -> Couple | None:
+        return None
+
+
+def test_a_stream_with_nothing_new_is_absent_with_those_that_need_it(tmp_path):
+    toys = graph(tmp_path)
+    nodes = tuple(replace(node, actor=Silent()) if node.name == "twice" else node for node in toys.nodes)
+    assert evaluate(replace(toys, nodes=nodes), GIVEN, "sum") == GIVEN | {"thrice": Couple(7, 15.0)}
 
 
 @pytest.mark.parametrize(("given", "wanted", "sentence"), [

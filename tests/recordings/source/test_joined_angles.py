@@ -14,7 +14,7 @@ from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AngleField, BareAngles, JoinedAngles, up_of
 from recordings.ros2.to_msg import header
 from stages.data import Tilt
-from tests.recordings.sample_log import START, TILT, dropped, items_of, missing_in, refused_in, write_sample
+from tests.recordings.sample_log import START, TILT, dropped, essences, items_of, missing_in, refused_in, write_sample
 
 FACING = (0.5, -0.5, 0.5, 0.5)
 PITCH, ROLL = AngleField("data", "deg", 1, "/pitch"), AngleField("data", "deg", 1, "/roll")
@@ -110,6 +110,16 @@ def test_the_frame_of_a_tilt_is_that_of_the_topic_that_has_one(tmp_path, stamped
     items = items_of(logged(tmp_path, headed={stamped}), source(pitch=pitch, roll=roll))
     frames = [item.frame_id for _, stream, item in items if stream == "inclinometer"]
     assert frames == ["tilt_link"] * 8
+
+
+def test_both_angles_may_name_one_topic(tmp_path):
+    paths = logged(tmp_path, headed={"/pitch"})
+    one = {"pitch": replace(PITCH, field="vector.x"), "roll": AngleField("vector.y", "deg", 1, "/pitch")}
+    apart = {name: replace(angle, topic=None) for name, angle in one.items()}
+    named, alone = source(**one), source(inclinometer="/pitch", **apart)
+    assert essences(items_of(paths, named)) == essences(items_of(paths, alone))
+    with named.open(paths) as log:
+        assert describe(log)["why"]["inclinometer"] == "as set"
 
 
 @pytest.mark.parametrize("verified_bytes", [0, 1 << 30])
