@@ -24,7 +24,7 @@ MIN_MATCHED = 0.7  # share of the nearest ground, in the median of the frames
 class CheckMatches(Stage):
     """The matched share of each frame, and a warning at the end of a run if little of the nearest ground is matched.
 
-    The nearest ground is in the lowest eighth of the rows.
+    The nearest ground is in the lowest eighth of the rows. Its matches of a confidence below 0.35 do not count.
     """
 
     def start(self) -> list[tuple[float, bool]]:
