@@ -94,6 +94,12 @@ def rolling_terrain(seed, *, amplitude=0.0, wavelength=6.0, slope=0.0, rocks=12,
     return Terrain(grid, blocks(above).mean(-1), blocks(index).max(-1))
 
 
+def grid(cells: int) -> list[Array]:
+    """The middles of the cells of a square map, x and y (rows, cols)."""
+    axis = (np.arange(cells) + 0.5) * 0.05
+    return list(np.meshgrid(axis, axis))
+
+
 def map_of(elevation: Array, resolution: float = 0.05, **layers: Array) -> ElevationMap:
     named = {"elevation": elevation, **layers}
     return ElevationMap(1, {k: v.astype(np.float32) for k, v in named.items()}, resolution, (0.0, 0.0), "level")

@@ -1,0 +1,55 @@
+"""Binarise doubts ground beside what is out of view: obstacles that the edge of view cuts, drops and holes."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import binary_dilation
+
+from stages.data import Cell, CellReason
+from stages.terrain.binarise import Binarise
+from stages.terrain.features import TerrainFeatures
+from stages.terrain.verdict_limits import doubts_at, turns_at
+from tests.stages.terrain.terrain_scene import grid, map_of
+
+X, Y = grid(80)
+
+
+@pytest.mark.parametrize(("cut", "free"), [(True, 0.0), (False, 1.0)])
+def test_a_low_flank_is_free_only_if_its_top_is_in_view(cut, free):
+    top, slope = (0.3, 0.6) if cut else (0.09, 0.2)
+    height = np.maximum(top - slope * np.hypot(X - 2, Y - 2), 0)
+    seen = X < 1.65 if cut else X < 3
+    terrain = map_of(np.where(seen, height, np.nan), occluded=np.where(seen, 0.0, np.nan).astype(np.float32))
+    result = Binarise()(TerrainFeatures()(terrain))
+    assert np.nanmax(terrain.layers["elevation"]) < 0.1
+    flank = seen & (height > 0.05)
+    assert flank.sum() > 5
+    assert (result.cells[flank] == Cell.FREE).mean() == free
+    assert (result.cells[seen & (np.hypot(X - 2, Y - 2) > 0.9)] == Cell.FREE).mean() > 0.9
+
+
+def test_a_wall_that_the_edge_of_view_cuts_far_away_names_its_doubt():
+    x, y = grid(160)
+    seen = y < 6.5
+    height = np.where(seen, np.where((y > 1) & (abs(x - 4) < 0.15), 0.12, 0.0), np.nan)
+    terrain = TerrainFeatures()(map_of(height, occluded=np.where(seen, 0.0, np.nan)))
+    rule, (row, col) = Binarise(), (30, 80)
+    assert rule(terrain).reason[row, col] == CellReason.UNSURE
+    assert doubts_at(rule, terrain, row, col) == ["on an obstacle that the edge of view cuts (min_rise)"]
+    assert "min_rise" in [turn.parameter for turn in turns_at(rule, terrain, row, col)]
+
+
+@pytest.mark.parametrize(
+    ("cells", "drop", "step", "free"),
+    [(6, 0.05, 0.06, False), (5, 0.05, 0.06, True), (6, 0.02, 0.06, True), (6, 0.05, 0.03, True)],
+    ids=["a hole", "a hole smaller than a wheel", "hidden ground that is not low", "even ground"],
+)
+def test_uneven_ground_at_a_hole_of_hidden_ground_is_unsure(cells, drop, step, free):
+    hole = np.zeros((40, 40), bool)
+    hole[17 : 17 + cells, 17 : 17 + cells] = True
+    layers = dict.fromkeys(("ground", "slope", "steepness", "roughness"), np.zeros(hole.shape))
+    layers |= {"step": np.full(hole.shape, step), "support": ~hole, "occluded": hole}
+    terrain = map_of(np.where(hole, np.nan, 0), **layers, drop=np.where(hole, drop, np.nan))
+    reason = Binarise()(terrain).reason
+    beside = binary_dilation(hole, np.ones((3, 3))) & ~hole
+    assert (reason[beside] == (CellReason.CLEAR if free else CellReason.UNSURE)).all()
+    assert (reason[:10] == CellReason.CLEAR).all()
