@@ -71,7 +71,7 @@ class Clean(Stage):
         chosen[self._supported(cloud, measured, cloud.shape)] = True
         others = np.flatnonzero(~measured)
         points = rows_of(cloud.points, others)
-        near = (points[:, 2] > 0) & (np.einsum("ij,ij->i", points, points) <= self._crop**2)
+        near = np.einsum("ij,ij->i", points, points) <= self._crop**2
         chosen[others[near]] = True
         return chosen
 
