@@ -138,8 +138,13 @@ def test_depth_order_kernel_equals_the_reference():
 
 @pytest.mark.parametrize(
     ("wrong", "disparity"),
-    [(np.s_[:60, 200:300], 45.0), (np.s_[110:150, 200:400], 17.0), (np.s_[400:480, 100:500], 14.0)],
-    ids=["in the sky", "above far ground", "under the ground"],
+    [
+        (np.s_[:60, 200:300], 45.0),
+        (np.s_[:60, 200:300], 14.0),
+        (np.s_[110:150, 200:400], 17.0),
+        (np.s_[400:480, 100:500], 14.0),
+    ],
+    ids=["in the sky", "in the sky, nearly beyond the crop", "above far ground", "under the ground"],
 )
 def test_a_large_patch_in_the_sky_or_under_the_ground_is_dropped(wrong, disparity):
     d, rock = rocks_seen(ROCK), rocks_seen(ROCK) - rocks_seen(()) > 1.0

@@ -84,6 +84,14 @@ def test_the_covariance_covers_the_errors_and_grows():
         assert spread[-1, 5] > spread[5, 5]
 
 
+def test_a_frame_known_better_than_the_one_before_does_not_change_the_errors():
+    """Both are tracked from one keyframe; what they have in common is unknown."""
+    stage, mount = Running(PoseFilter()), mount_of(DRIVE, based=False)
+    seen = [replace(FIRST, covariance=variance * np.eye(6)) for variance in (0, 4e-4, 1e-4)]
+    variances = [stage(motion, UPRIGHT, mount).covariance[0, 0] for motion in seen]
+    np.testing.assert_allclose(variances, [0, 4e-4, 4e-4])
+
+
 def test_a_rover_that_stands_does_not_move_with_the_noise_of_its_tilt():
     """Each tilt moves the camera, 1 m from base_link, but not base_link."""
     noise, rng, places, stated = np.radians(0.5), np.random.default_rng(0), [], []

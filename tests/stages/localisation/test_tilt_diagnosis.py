@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from stages.data import Array
-from stages.localisation.tilt.causes import Evidence
-from stages.localisation.tilt.diagnosis import diagnose
+from stages.localisation.tilt.causes import Cause, Evidence
+from stages.localisation.tilt.diagnosis import _same, diagnose
 from tests.conftest import slow
 from tests.stages.localisation.drive import Drive
 from tests.tilt_faults import degrees_as_radians, exchanged, flipped, radians_as_degrees
@@ -43,6 +43,7 @@ def about(axis: str, degrees: float) -> Array:
 def test_wrong_signs_axes_and_units_are_named(drive, change, name):
     found = diagnose(drive.evidence(change=change))
     assert found.fault.startswith(name), found.sentence
+    assert " or " not in found.fault, "a rotation of the mount that is the same fault is not named too"
 
 
 def test_a_wrong_unit_is_named_on_nearly_level_ground_not_always_seen():
@@ -114,6 +115,21 @@ def test_a_sound_tilt_on_rolling_ground_is_reported_as_sound():
     found = diagnose(Drive(2, 8.0).evidence())
     assert found.clear
     assert found.sentence.startswith("Tilt and camera agree to 0.")
+
+
+@pytest.mark.parametrize(("gap", "clear"), [(1.4, True), (1.6, False)])
+def test_frames_far_apart_in_time_do_not_rule_out_a_time_offset(gap, clear):
+    evidence = Drive(2, 8.0, 0.1).evidence()
+    found = diagnose(replace(evidence, stamps=np.arange(len(evidence.stamps)) * round(gap * 1e9)))
+    assert found.clear == clear
+    assert ("whether the tilt's stamps are early or late" in found.sentence) != clear
+
+
+@pytest.mark.parametrize(("apart", "same"), [(11, True), (13, False), (180, False)])
+def test_rotations_within_12_degrees_are_one_fault(apart, same):
+    one, other = (Cause("", "", 0.0, 0.0, undone=about("x", angle)) for angle in (20, 20 + apart))
+    assert _same(one, other) == same
+    assert not _same(one, replace(other, undone=None))
 
 
 def still(drive: Drive, frames: int) -> Evidence:

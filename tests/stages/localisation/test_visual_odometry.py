@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import Halve, PixelOrigin, StereoCamera, StereoFrame, Transform, VisualOdometry
-from stages.localisation.visual_odometry import MIN_FEATURES, _plausible
-from stages.localisation.vo_tracking import MAX_DEPTH, Step, vo_frame
+from stages.localisation.visual_odometry import MIN_FEATURES, OdometryMemory, _Keyframe, _plausible, _tracked
+from stages.localisation.vo_tracking import MAX_DEPTH, Step, VoFrame, _fitted, vo_frame
 from tests.stages.builders import disparity_of
 from tests.stages.running import Running
 
@@ -171,3 +171,26 @@ def test_a_resumed_run_continues_with_the_number_of_the_segment(drive):
 def test_a_motion_that_is_long_or_rough_is_not_plausible(rms, metres, plausible):
     step = Step(np.eye(3), np.array([0.0, 0.0, metres]), 100, rms, 1.0, np.eye(6))
     assert _plausible(step) == plausible
+
+
+@pytest.mark.parametrize(("flow", "shared", "features", "replaced"), [
+    (2.9, 51, 40, False), (3.1, 51, 40, True), (2.9, 49, 40, True), (3.1, 49, 39, False),
+])  # fmt: skip
+def test_a_frame_far_from_the_keyframe_or_with_few_of_its_features_replaces_it(flow, shared, features, replaced):
+    """Its image has a width of 100 px and the keyframe 100 features. A frame with few features does not replace it."""
+    camera, gray = StereoCamera(90.0, 90.0, 50.0, 40.0, 0.2, 100, 80), np.zeros((80, 100), np.uint8)
+    before, now = (VoFrame(gray, None, None, np.ones((count, 3)), camera) for count in (100, features))
+    keyframe = _Keyframe(before, Transform("start", "camera", np.eye(3), np.zeros(3)), np.zeros((6, 6)))
+    state = OdometryMemory(keyframe)
+    _tracked(7, keyframe, Step(np.eye(3), np.zeros(3), shared, 1.0, flow, np.eye(6)), now, state)
+    assert (state.keyframe.frame is now) == replaced
+
+
+@pytest.mark.parametrize(("same", "found"), [([], True), ([2], True), ([1, 2], False)], ids=["room", "plane", "line"])
+def test_points_on_a_line_determine_no_motion(same, found):
+    points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 6], (60, 3))
+    points[:, same] = 4.0  # m
+    matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    pixels = (points @ matrix.T)[:, :2] / points[:, 2:]
+    step = _fitted(points, pixels, pixels, matrix, np.zeros(3), np.zeros(3), MIN_FEATURES)
+    assert (step is not None) == found

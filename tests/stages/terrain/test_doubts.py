@@ -53,3 +53,25 @@ def test_uneven_ground_at_a_hole_of_hidden_ground_is_unsure(cells, drop, step, f
     beside = binary_dilation(hole, np.ones((3, 3))) & ~hole
     assert (reason[beside] == (CellReason.CLEAR if free else CellReason.UNSURE)).all()
     assert (reason[:10] == CellReason.CLEAR).all()
+
+
+def even(hidden, **layers):
+    """Level ground whose cells `hidden` (rows, cols) are occluded, with some other layers."""
+    known = dict.fromkeys(("ground", "step", "slope", "steepness", "roughness"), np.zeros(hidden.shape))
+    return map_of(np.where(hidden, np.nan, 0.0), **known | {"support": ~hidden, "occluded": hidden} | layers)
+
+
+def test_hidden_ground_up_to_a_metre_from_a_drop_may_fall_away_already():
+    hidden = (Y > 1) & (Y < 3)
+    drop = np.where(hidden & (X < 0.5), 0.2, np.where(hidden, 0.0, np.nan))
+    reason = Binarise()(even(hidden, drop=drop)).reason
+    beside = binary_dilation(hidden, np.ones((3, 3))) & ~hidden
+    assert (reason[beside & (X < 1.5)] == CellReason.UNSURE).all()
+    assert (reason[beside & (X > 1.75)] == CellReason.CLEAR).all()
+
+
+@pytest.mark.parametrize(("step", "free"), [(0.09, True), (0.11, False)])
+def test_a_step_at_the_edge_of_view_may_continue_from_twice_the_least_rise(step, free):
+    beyond = X > 3
+    terrain = even(beyond, step=np.full(X.shape, step), occluded=np.where(beyond, np.nan, 0.0))
+    assert (Binarise()(terrain).cells[(X > 2.9) & ~beyond] == Cell.FREE).all() == free

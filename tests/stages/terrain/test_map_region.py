@@ -8,12 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stages import ElevationMap, Fuse, FuseRegion, MapRegion, Region, Transform
+from stages import ElevationMap, Fuse, FuseRegion, MapRegion, Region, TerrainFeatures, Transform
 from stages.data import Tiles
 from stages.terrain.fused_map import CELL
-from stages.terrain.map_region import MAX_GAP
 from tests.stages.running import Running
-from tests.stages.terrain.region_scene import MOUNT, drive
+from tests.stages.terrain.region_scene import MOUNT, drive, rolling
 
 ROOM = 1e-9
 
@@ -64,10 +63,26 @@ def test_the_last_map_before_a_new_start_comes_first(change):
     assert [item.epoch for item in mapped(regions, 1.0)] == [0, 0, *[change.get("epoch", 0)] * 2]
 
 
-def test_a_map_precedes_a_jump_that_the_next_one_would_not_span():
-    regions = [region(number, x) for number, x in enumerate((0.0, 0.3, 0.3 + 2 * MAX_GAP, 0.4 + 2 * MAX_GAP))]
-    assert stamps(regions, 1.0) == [0, 1, 3]
-    assert max(item.shape[1] for item in mapped(regions, 1.0)) < MAX_GAP / 0.5
+@pytest.mark.parametrize(("jump", "expected"), [(19.0, [0, 2, 3]), (21.0, [0, 1, 3]), (40.0, [0, 1, 3])])
+def test_a_map_precedes_a_jump_of_20_metres_that_no_map_spans(jump, expected):
+    regions = [region(number, x) for number, x in enumerate((0.0, 0.3, 0.3 + jump, 0.4 + jump))]
+    assert stamps(regions, 1.0) == expected
+    assert max(item.shape[1] for item in mapped(regions, 1.0)) * 0.5 < 20 + 5
+
+
+def test_the_features_of_what_a_frame_changes_do_not_depend_on_the_window():
+    fuse, maps = Running(FuseRegion()), [Running(MapRegion(window=width)) for width in (1.0, 40.0)]
+    for frame in (0, 4):
+        fused = fuse(*drive(frame, ground=lambda x, y: 0.2 * rolling(x, y)), MOUNT)
+        row, col, end_row, end_col = fused.changed
+        small, large = (TerrainFeatures()(each(fused)) for each in maps)
+        assert small.layers["elevation"].size < 0.4 * large.layers["elevation"].size
+        for name in ("ground", "step", "slope", "steepness", "roughness"):
+            parts = []
+            for each in (small, large):
+                left, low = (round(place / 0.05) for place in each.origin)
+                parts.append(each.layers[name][row - low : end_row - low, col - left : end_col - left])
+            np.testing.assert_allclose(*parts, atol=1e-6, err_msg=name)
 
 
 @pytest.mark.parametrize(("step", "ways"), [(0.0, [1.5] * 5), (1.0, [0.4] * 6), (2.0, [0.3, 0.3, 6.0, 0.3, 24.0, 1.0])])
