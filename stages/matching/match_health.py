@@ -37,7 +37,7 @@ class CheckMatches(Stage):
         rows, half = max(1, round(NEAR_ROWS * height)), np.s_[:, width // 2 :]
         source = disparity.source[half]
         matched = (source == PixelOrigin.MEASURED) | (source == PixelOrigin.PLANE)
-        confident = matched & (disparity.confidence[half] >= MIN_CONFIDENCE)
+        confident = matched & ~(disparity.confidence[half] < MIN_CONFIDENCE)  # NaN if a stage states none
         near = float(confident[-rows:].mean())
         pixels = np.where(confident, disparity.pixels[half], np.nan)
         top, low = pixels[:rows], pixels[height // 2 :]

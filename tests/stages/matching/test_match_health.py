@@ -28,6 +28,11 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     assert "Only 0 % of the nearest ground is matched" in found.sentence
 
 
+@pytest.mark.parametrize(("confidence", "near"), [(0.36, 1), (0.34, 0), (np.nan, 1)])
+def test_doubtful_matches_of_the_nearest_ground_do_not_count(confidence, near):
+    assert Running(CheckMatches())(disparity_of(np.ones((80, 100)), confidence=np.float64(confidence))).near == near
+
+
 @pytest.fixture(scope="module")
 def frame():
     """A simulated frame of ground up to 46 px near."""
