@@ -10,7 +10,7 @@ import pytest
 
 from flow.contracts import StageError
 from stages import Binarise, Cell, Fuse, FuseRegion, PixelOrigin, TerrainFeatures
-from stages.terrain.fused_map import SHARED_SHARE
+from stages.terrain.fused_map import CELL, SHARED_SHARE, Observation, merged
 from stages.terrain.map_registration import frame_grid, register
 from tests.conftest import slow
 from tests.stages.running import Running
@@ -162,6 +162,17 @@ def test_one_uncertain_frame_does_not_overturn_many():
     _, terrain = fused([*frames, drive(6, flat, at=(0.3, 0.0, 0.0), sigma=0.3)])
     assert cell(terrain, 4.02, 0.02) == pytest.approx(0.5, abs=1e-3)
     assert cell(terrain, 4.02, 0.02, "last") == 5.0
+
+
+@pytest.mark.parametrize(("sigmas", "contradicted"), [(2.9, False), (3.1, True)])
+def test_heights_three_sigma_apart_are_a_doubt_until_a_frame_agrees(sigmas, contradicted):
+    def seen(height: float, sigma: float) -> Observation:
+        return Observation(*np.array([[0, 0, height, height, height, sigma**2, 5]]).T)
+
+    cells = merged(np.zeros(1, CELL), seen(0.0, 0.01), 0)
+    cells = merged(cells, seen(sigmas * np.hypot(0.01, 0.02), 0.02), 1)
+    assert (cells["contradictions"][0], cells["doubt"][0] > 0) == (contradicted, contradicted)
+    assert merged(cells, seen(0.0, 0.01), 2)["doubt"][0] == 0
 
 
 def test_an_obstacle_that_appears_is_never_mapped_as_sure_flat_ground():

@@ -68,6 +68,20 @@ def test_a_covariance_that_states_nothing_gives_finite_planes(stated):
     assert np.abs(planes).max() < 0.05
 
 
+def test_a_pose_far_off_its_stated_errors_is_corrected_at_once():
+    """The pose is 0.03 m too high, and states 1 mm."""
+    levelling = MapLevelling.begin(pose(0.0), STATED).tilted(np.array([0, 0, 1.0]), TILT_SIGMA).placed()
+    levelling = levelling.moved(pose(0.3, 0.03, covariance=1e-6 * np.eye(6)), STATED)
+    levelling = levelling.overlapped(np.array([-0.03, 0, 0]), SURE, np.array([0, 0, 1.0]))
+    assert levelling.mean[0] == pytest.approx(-0.03, abs=0.002)
+    assert abs(levelling.mean[3]) < 0.002
+
+
+def test_the_pitch_of_a_pose_leans_ahead_and_its_roll_sideways():
+    begun = MapLevelling.begin(pose(0, covariance=np.diag([1, 1, 1, 4e-4, 9e-4, 1])), STATED)
+    np.testing.assert_allclose(np.diag(begun.covariance)[1:3], [9e-4, 4e-4])
+
+
 def test_a_pose_whose_covariance_grows_may_have_moved_that_far():
     before = MapLevelling.begin(pose(0, covariance=1e-4 * np.eye(6)), STATED)
     grown = before.moved(pose(0, covariance=5e-4 * np.eye(6)), STATED)

@@ -131,14 +131,14 @@ def test_a_frame_that_cannot_be_registered_does_not_change_the_map(change, messa
     np.testing.assert_array_equal(fuse.state.cells.read(-300, -300, 600, 600), before)
 
 
-@pytest.mark.parametrize(("degrees", "warned"), [(0, False), (3, False), (12, True)])
+@pytest.mark.parametrize(("degrees", "warned"), [(0, False), (4, False), (6, True), (12, True)])
 def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
     frames = (drive(frame) for frame in range(4))
     fuse, _ = fused((cloud, leant(pose, degrees)) for cloud, pose in frames)
     found = fuse.finding()
     assert (found is not None) == warned
     if found:
-        assert "'odom' is 12 degrees off the vertical" in found.sentence
+        assert f"'odom' is {degrees} degrees off the vertical" in found.sentence
         assert found.severity == "warning"
 
 
