@@ -7,7 +7,7 @@ import pytest
 
 from flow.contracts import Loss, LossReason, StageError
 from flow.runtime.ledger import Ledger, failure
-from stages import StereoFrame
+from stages import StereoCamera, StereoFrame
 
 
 def sentence_of(call):
@@ -25,7 +25,8 @@ def test_a_stage_error_is_shown_as_it_is():
 
 
 def test_a_stage_error_of_a_called_library_is_shown_as_it_is():
-    assert sentence_of(lambda: StereoFrame(0, np.zeros((2, 2), np.uint8), np.zeros((2, 3), np.uint8), None)) == (
+    camera = StereoCamera(fx=1.0, fy=1.0, cx=1.0, cy=1.0, baseline=0.1, width=2, height=2)
+    assert sentence_of(lambda: StereoFrame(0, np.zeros((2, 2), np.uint8), np.zeros((2, 3), np.uint8), camera)) == (
         "StereoFrame: left is (2, 2), right is (2, 3)"
     )
 
