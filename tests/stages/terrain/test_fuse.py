@@ -58,6 +58,29 @@ def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch)
     assert np.isnan(cell(terrain, 2.52, 0.02, "ceiling"))
 
 
+def test_the_ceiling_of_a_frame_is_aligned_with_its_cells(monkeypatch):
+    def hiding(*arguments):
+        frame = frame_grid(*arguments)
+        ceiling = np.where(frame.known, np.nan, next(ceilings)).astype(np.float32)
+        return replace(frame, terrain=replace(frame.terrain, layers={**frame.terrain.layers, "ceiling": ceiling}))
+
+    use_whole_frames(monkeypatch)
+    monkeypatch.setattr("stages.terrain.fuse.frame_grid", hiding)
+    ceilings, first, (cloud, pose) = iter((np.nan, -0.14)), *(drive(n, flat, at=(0.0, 0.0, 0.0)) for n in range(2))
+    raised = replace(pose, position=pose.position + np.array([0, 0, 0.06]))
+    _, terrain = fused([first, (cloud, raised)])
+    assert cell(terrain, 4.02, 0.02) == pytest.approx(0, abs=0.002)
+    assert cell(terrain, 1.02, 0.02, "ceiling") == pytest.approx(-0.2, abs=0.002)
+
+
+@pytest.mark.parametrize(("sigma", "leans"), [(1e-4, 0.01), (0.1, 0.0)])
+def test_the_tilt_counts_by_the_sigma_of_its_own_frame(sigma, leans):
+    cloud, pose = drive(0, flat, tilt=(0.01, 0.0), at=(0.0, 0.0, 0.0))
+    _, terrain = fused([(replace(cloud, tilt_sigma=sigma), pose)], attitude_sigma=0.01)
+    rise = cell(terrain, 6.02, 0.02) - cell(terrain, 3.02, 0.02)
+    assert rise / 3 == pytest.approx(leans, abs=0.001)
+
+
 def use_whole_frames(monkeypatch):
     """Let the grid of a frame keep the cells that it does not show."""
     monkeypatch.setattr("stages.terrain.dem.Voxelise._window", lambda self, cloud, ceiling, whole: whole)
