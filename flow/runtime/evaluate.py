@@ -33,11 +33,15 @@ def evaluate(
 
     Examples
     --------
+    >>> import numpy as np
     >>> from flow.config.loader import load
-    >>> from flow.runtime.evaluate import evaluate
-    >>> streams = evaluate(load("rover"), {"rectified": frame}, "disparity")  # doctest: +SKIP
-    >>> streams["disparity"].sigma.shape  # doctest: +SKIP
-    (960, 1280)
+    >>> from stages import StereoCamera, StereoFrame
+    >>> scene = np.random.default_rng(0).integers(0, 256, (96, 134), np.uint8)
+    >>> camera = StereoCamera(fx=100, fy=100, cx=64, cy=48, baseline=0.1, width=128, height=96)
+    >>> frame = StereoFrame(0, scene[:, :128], scene[:, 6:], camera)
+    >>> streams = evaluate(load("rover", ["disparities=32"]), {"rectified": frame}, "disparity")
+    >>> round(float(np.nanmedian(streams["disparity"].pixels)), 1)
+    6.0
     """
     plan, lacking = dict[str, tuple[Node, dict[str, str]]](), dict[str, str]()  # lacking: stream -> the one to give
     for node in needed(graph, given, wanted):
