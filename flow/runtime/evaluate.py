@@ -7,7 +7,7 @@ from typing import Any
 
 from flow.contracts import nearest
 from flow.errors import UsageError
-from flow.runtime.graph import Graph, Node, ports_of
+from flow.runtime.graph import Graph, Node, ports_of, start, unfit
 
 
 def evaluate(
@@ -29,7 +29,8 @@ def evaluate(
     Raises
     ------
     UsageError
-        If the pipeline lacks one of these streams, or if another one must be given, as of an aligner.
+        If the pipeline lacks one of these streams, if another one must be given, as of an aligner, or if a setting
+        needs an input that is left out.
 
     Examples
     --------
@@ -51,15 +52,18 @@ def evaluate(
             lacking[node.name] = node.name
         elif required := absent and absent - ports_of(type(node.actor))[1]:
             lacking[node.name] = lacking[node.inputs[min(required)]]
+        elif absent and (why := unfit(node.name, node.actor, inputs)):
+            raise UsageError(why)
         else:
             plan[node.name] = node, inputs
     if wanted not in {*given, *plan}:
         missing = lacking.get(wanted, wanted)
         raise UsageError(f"'{wanted}' needs a stream that only a run makes from a log; give '{missing}'")
     streams, states = dict(given), {} if states is None else states
+    states |= start(node for name, (node, _) in plan.items() if name not in states)
     for name, (node, inputs) in plan.items():
         if streams.keys() >= {*inputs.values()}:
-            state = {"state": states.setdefault(name, node.actor.start())} if node.stateful else {}
+            state = {"state": states[name]} if node.stateful else {}
             item = node.actor(**{port: streams[stream] for port, stream in inputs.items()}, **state)
             streams |= {} if item is None else {name: item}
     return streams

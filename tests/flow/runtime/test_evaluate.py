@@ -42,6 +42,8 @@ def test_an_input_that_a_stage_can_do_without_may_be_left_out(tmp_path):
     toys = load(str(tmp_path / "open.yaml"))
     assert evaluate(toys, GIVEN, "either")["either"] == Couple(7, 5.0)
     assert evaluate(toys, GIVEN | {"height": Number(7, 1.0)}, "either")["either"] == Couple(7, 6.0)
+    with pytest.raises(UsageError, match=r"stream 'either': Either\.both needs a `b`"):
+        evaluate(load(str(tmp_path / "open.yaml"), ["either.both=true"]), GIVEN, "either")
 
 
 @dataclass(frozen=True)
