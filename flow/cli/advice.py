@@ -138,10 +138,8 @@ def _flow(value: Any) -> str:
     value = list(value) if isinstance(value, tuple) else value
     if is_dataclass(value):
         own = [(known, getattr(value, known.name)) for known in fields(value)]
-        units = {known.name: known.metadata["unit"] for known, part in own if part != known.default}
-        value = {
-            name: as_written(vars(value)[name], unit) if unit else vars(value)[name] for name, unit in units.items()
-        }
+        changed = {known.name: (part, known.metadata["unit"]) for known, part in own if part != known.default}
+        value = {name: as_written(part, unit) if unit else part for name, (part, unit) in changed.items()}
     return yaml.safe_dump(value, default_flow_style=True, width=10_000, sort_keys=False).removesuffix("...\n").strip()
 
 
