@@ -22,6 +22,7 @@ from recordings.sinks import colormaps
 from recordings.sinks.blueprint import CURVES, LEDGER, LEDGER_CHARS, Panel, ViewSpec
 from recordings.sinks.colormaps import UNKNOWN_RGB, Legend, Rgb
 from recordings.sinks.entity_rows import (
+    At,
     Component,
     Drawn,
     EntityRows,
@@ -33,9 +34,8 @@ from recordings.sinks.entity_rows import (
     image_format,
     masking,
 )
-from stages.data import Array, ElevationMap, NavigationMap, StereoCamera, Transform
+from stages.data import Array, ElevationMap, NavigationMap, StereoCamera
 
-Sides = tuple[float, float]  # along the width and the height
 TEXT_RGB: Rgb = (225, 228, 235)
 CAMERA_RGB: Rgb = (255, 210, 60)
 VEIL: tuple[int, int, int, int] = (96, 100, 112, 170)  # over guesses
@@ -52,6 +52,7 @@ LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, 
 ROW_BESIDE = 0.27  # least height of a row of a legend beside the picture, share of the picture's height
 MAX_UNIT_CHARS = 3  # of a unit that stands at each value of a scale; a longer one stands at the last
 CLEARED = components_of(rr.Clear(recursive=False))
+(NUMBER,) = (one.descriptor for one in components_of(rr.Scalars(0.0)))
 HEADROOM = 0.35  # above the first row of a legend, share of the height of a row
 
 
@@ -67,6 +68,7 @@ class Canvas:
     recording: rr.RecordingStream
     jpeg_quality: int
     max_width: int  # of a picture, px; 0: by the camera's images
+    at: At = (0, 0)  # the frame's
     pictures: bool = True  # whether this frame's images, clouds and surfaces are drawn
     full_size: frozenset[str] = frozenset()  # streams of disparities and images that are no intermediates
     sized: frozenset[str] = frozenset()  # all streams of disparities and images
@@ -77,7 +79,6 @@ class Canvas:
     views: dict[tuple[Panel, str], ViewSpec] = field(default_factory=dict)
     camera: StereoCamera | None = None
     ways: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # frame -> x and y of the poses so far
-    numbers: dict[str, float] = field(default_factory=dict)  # path -> value of the frame, NaN where it has none
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _texts: dict[str, str] = field(default_factory=dict)
     _legends: dict[str, Legend] = field(default_factory=dict)
@@ -86,21 +87,20 @@ class Canvas:
     _kept: dict[str, Hashable] = field(default_factory=dict)
     _recurred: dict[str, tuple[Component, ...]] = field(default_factory=dict)
     _veiled: set[str] = field(default_factory=set)
-    _lenses: dict[str, tuple[Component, ...]] = field(default_factory=dict)
     _before: dict[str, type] = field(default_factory=dict)
     _now: dict[str, type] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.rows = EntityRows(self.recording)
+        self.rows, self.numbers = EntityRows(self.recording), EntityRows(self.recording)
 
     def log(self, path: str, archetype: Any, *views: ViewSpec) -> None:
         """Log an entity at the frame's time; views: where the blueprint shows it."""
         shown = archetype if isinstance(archetype, Drawn) else Drawn(type(archetype), components_of(archetype))
-        self._log(path, *shown)
+        self.log_components(path, *shown)
         for view in views:
             self.add_view(view)
 
-    def _log(
+    def log_components(
         self,
         path: str,
         kind: type,
@@ -111,7 +111,7 @@ class Canvas:
         logged = {*map(id, self._recurred.get(path, ()))} if path in self._before else ()
         changed = (one for one in recurring if id(one) not in logged)
         self._recurred[path] = recurring
-        self.rows.add(path, (*content, *changed))
+        self.rows.add(path, self.at, (*content, *changed))
         self._now[path] = kind
         if self.counts_bytes:
             self.logged_bytes += sum(one.nbytes for one in (*content, *recurring))
@@ -128,16 +128,15 @@ class Canvas:
             self._kept[path] = content
             self.log(path, draw())
 
-    def place_camera(self, path: str, place: Transform, focal: Sides, centre: Sides, size: tuple[int, int]) -> None:
-        """A camera's frustum. It stays in a frame without one. focal, centre, size: across and down, px."""
-        lens = _lens(focal, centre, size)
-        known, self._lenses[path] = self._lenses.get(path) is lens, lens
-        posed = components_of(rr.Transform3D(translation=place.translation, mat3x3=place.rotation))
-        self.rows.add(path, posed if known else posed + lens)
-
     def keep_all(self, stream: str) -> None:
         """Leave the entities of a stream as they were in the last frame."""
         self._now |= {path: kind for path, kind in self._before.items() if path.startswith(f"{stream}/")}
+
+    def log_number(self, path: str, value: float, view: ViewSpec) -> None:
+        """A value over time. Numbers wait for those of other frames: one by one they would be half of all calls."""
+        self.numbers.add(path, self.at, (Component(NUMBER, float(value)),))
+        self._now[path] = rr.Scalars
+        self.add_view(view)
 
     def plot(self, path: str, value: float, view: ViewSpec) -> None:
         """A value over time; the first five curves of a panel differ in colour."""
@@ -148,8 +147,7 @@ class Canvas:
             self.name_curves(
                 f"{CURVES}/{view.panel.name}", [name.rpartition("/")[2].replace("\\", "") for name in drawn]
             )
-        self.numbers[path], self._now[path] = float(value), rr.Scalars
-        self.add_view(view)
+        self.log_number(path, value, view)
 
     def name_curves(self, path: str, names: Sequence[str]) -> None:
         """Log the names of curves below each other, in the colours of `CURVE_RGB`."""
@@ -158,12 +156,18 @@ class Canvas:
         labels = rr.Points2D(places, colors=colors, radii=rr.Radius.ui_points(0.5), labels=names, show_labels=True)
         self.recording.log(path, labels, static=True)
 
-    def log_text(self, path: str, text: str, level: rr.TextLogLevel) -> None:
-        """A line in the ledger, unless it is the last one of `path`."""
+    def log_text(
+        self, path: str, text: str, level: rr.TextLogLevel = rr.TextLogLevel.INFO, at: At | None = None
+    ) -> None:
+        """A text in lines that the ledger has room for. at: the frame's time by default."""
+        for line in wrap(text, LEDGER_CHARS, subsequent_indent="... ", break_long_words=False, break_on_hyphens=False):
+            self.rows.add(path, at or self.at, drawn(rr.TextLog, text=line, level=level).components)
+
+    def log_change(self, path: str, text: str, level: rr.TextLogLevel) -> None:
+        """A text in the ledger, unless it is the last one of `path`."""
         if self._texts.get(path) != text:
             self._texts[path] = text
-            for line in lines_of(text):
-                self.recording.log(f"{LEDGER}/{path}", rr.TextLog(line, level=level))
+            self.log_text(f"{LEDGER}/{path}", text, level)
 
     @property
     def whole_width(self) -> int:
@@ -194,13 +198,13 @@ class Canvas:
 
     def log_blob(self, path: str, kind: type, content: bytes | Array, view: ViewSpec, **fields: Any) -> None:
         """An image that is encoded already, and the other fields of its archetype, which recur."""
-        self._log(path, kind, [blob(kind, "blob", content)], fields_of(kind, **fields))
+        self.log_components(path, kind, [blob(kind, "blob", content)], fields_of(kind, **fields))
         self.add_view(view)
 
     def _log_raw(self, path: str, kind: type, pixels: Array, recurring: tuple[Component, ...] = ()) -> None:
         """Log an image that is not encoded."""
         form = image_format(kind, pixels.shape, pixels.dtype)
-        self._log(path, kind, [blob(kind, "buffer", pixels)], (*form, *recurring))
+        self.log_components(path, kind, [blob(kind, "buffer", pixels)], (*form, *recurring))
 
     def log_values(
         self,
@@ -310,33 +314,18 @@ class Canvas:
             if path in self._now:
                 continue
             if issubclass(kind, rr.Scalars):
-                self.numbers[path] = math.nan
-                continue
-            if issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
+                self.numbers.add(path, self.at, (Component(NUMBER, math.nan),))
+            elif issubclass(kind, rr.EncodedImage | rr.EncodedDepthImage):
                 # The viewer goes on showing a cleared encoded image (rerun-io/rerun#12793), but not an empty one.
-                self.rows.add(path, fields_of(kind, clear_unset=True))
+                self.rows.add(path, self.at, fields_of(kind, clear_unset=True))
             else:
-                self.rows.add(path, CLEARED)
+                self.rows.add(path, self.at, CLEARED)
         self._before, self._now = self._now, {}
-
-
-def lines_of(text: str) -> list[str]:
-    """A text in lines that the ledger has room for."""
-    return wrap(text, LEDGER_CHARS, subsequent_indent="... ", break_long_words=False, break_on_hyphens=False)
 
 
 def label_counts(labels: Array) -> Array:
     """The number of pixels with each of 256 labels, (256,); labels: (H, W) uint8."""
     return np.ravel(cv2.calcHist([labels], [0], None, [256], [0, 256]))
-
-
-@lru_cache(maxsize=16)
-def _lens(focal: Sides, centre: Sides, size: tuple[int, int]) -> tuple[Component, ...]:
-    lens = rr.Pinhole(
-        focal_length=focal, principal_point=centre, resolution=size, color=CAMERA_RGB,
-        camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.7,
-    )  # fmt: skip
-    return components_of(lens)
 
 
 @lru_cache(maxsize=16)

@@ -34,15 +34,20 @@ class Blob(NamedTuple):
         return int(self.content.size) + 4
 
 
+At = tuple[int, int]  # the stamp, ns, and the number of a frame
+
+
 class Component(NamedTuple):
     """A component of an entity in one row."""
 
     descriptor: rr.ComponentDescriptor
-    content: Any  # an array of Arrow, or a Blob
+    content: Any  # an array of Arrow, a Blob, or a number
 
     @property
     def nbytes(self) -> int:
         """The size of its content. Arrow takes ten times as long for the `nbytes` of an array."""
+        if isinstance(self.content, float):
+            return 8
         return int(self.content.nbytes if isinstance(self.content, Blob) else self.content.get_total_buffer_size())
 
 
@@ -59,24 +64,17 @@ class _Column(NamedTuple):
         return self.values
 
 
-class _Row(NamedTuple):
-    stamp: int
-    frame: int
-    components: Sequence[Component]
-
-
 class EntityRows:
     """The rows that wait, by the paths of their entities. An entity's rows are sent when they have `BATCH_BYTES`."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._recording = recording
-        self._rows: defaultdict[str, list[_Row]] = defaultdict(list)
+        self._rows: defaultdict[str, list[tuple[At, Sequence[Component]]]] = defaultdict(list)
         self._bytes: defaultdict[str, int] = defaultdict(int)
-        self.stamp, self.frame = 0, 0  # of the next rows
 
-    def add(self, path: str, components: Sequence[Component]) -> None:
+    def add(self, path: str, at: At, components: Sequence[Component]) -> None:
         """Add a row."""
-        self._rows[path].append(_Row(self.stamp, self.frame, components))
+        self._rows[path].append((at, components))
         self._bytes[path] += sum(one.nbytes for one in components)
         if self._bytes[path] >= BATCH_BYTES:
             self._send(path)
@@ -89,18 +87,14 @@ class EntityRows:
     def _send(self, path: str) -> None:
         rows, columns = self._rows.pop(path), dict[rr.ComponentDescriptor, list[Any]]()
         del self._bytes[path]
-        for number, row in enumerate(rows):
-            for descriptor, content in row.components:
+        for number, (_, components) in enumerate(rows):
+            for descriptor, content in components:
                 columns.setdefault(descriptor, [None] * len(rows))[number] = content
         sent = [_Column(descriptor, _listed(contents)) for descriptor, contents in columns.items()]
-        clocks = clocks_of([row.stamp for row in rows], [row.frame for row in rows])
+        stamps, frames = zip(*(at for at, _ in rows), strict=True)
+        times = np.array(stamps, "datetime64[ns]")
+        clocks = [rr.TimeColumn(CLOCK, timestamp=times), rr.TimeColumn(FRAME, sequence=frames)]
         self._recording.send_columns(path, indexes=clocks, columns=sent, strict=True)  # type: ignore[arg-type]
-
-
-def clocks_of(stamps: Sequence[int], frames: Sequence[int]) -> list[rr.TimeColumn]:
-    """The recording's two timelines at these stamps, ns, and frames."""
-    times = np.array(stamps, "datetime64[ns]")
-    return [rr.TimeColumn(CLOCK, timestamp=times), rr.TimeColumn(FRAME, sequence=frames)]
 
 
 class Drawn(NamedTuple):
@@ -191,6 +185,8 @@ def blob(kind: Any, field: str, content: bytes | Array) -> Component:
 def _listed(contents: Sequence[Any]) -> pa.ListArray:
     """What many rows have of a component: nothing where it is cleared, null where a row leaves it out."""
     present = [content for content in contents if content is not None]
+    if isinstance(present[0], float):
+        return pa.array([[content] if content is not None else None for content in contents])
     blobs = [content for content in present if isinstance(content, Blob)]
     values = _joined(blobs) if blobs else pa.concat_arrays(present)
     lengths = [0 if content is None else 1 if isinstance(content, Blob) else len(content) for content in contents]

@@ -13,7 +13,7 @@ from recordings.png import png
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import CAMERA_RGB, MAX_POINTS, Canvas, label_counts
-from recordings.sinks.entity_rows import drawn
+from recordings.sinks.entity_rows import components_of, drawn, fields_of
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -54,6 +54,9 @@ MAX_DEPTH = 16.0  # m, the upper end of the scale of depths
 MIN_DEPTH = 0.2  # m in front of the camera, of what is drawn over its image
 HAZARD_LIFT = 0.03  # m above the ground at which hazards are drawn, so that the surface does not hide them
 THUMBNAIL_SCALE = 0.25  # of the image in the camera's frustum
+FRUSTUM = components_of(
+    rr.Pinhole.from_fields(color=CAMERA_RGB, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.7)
+)
 
 Logger = Callable[..., str | None]
 LOGGERS: dict[tuple[type, ...], Logger] = {}
@@ -252,7 +255,7 @@ def log_health(canvas: Canvas, stream: str, health: TiltHealth) -> str:
         if np.isfinite(angle):
             path = f"{stream}/{rr.escape_entity_path_part(name)}"
             canvas.plot(path, np.degrees(angle), ViewSpec(Panel.HEALTH, stream, "", stream))
-    canvas.log_text(stream, health.judgement, rr.TextLogLevel.WARN if health.fault else rr.TextLogLevel.INFO)
+    canvas.log_change(stream, health.judgement, rr.TextLogLevel.WARN if health.fault else rr.TextLogLevel.INFO)
     return f"{stream}: {health.fault}" if health.fault else ""
 
 
@@ -340,8 +343,11 @@ def log_camera(canvas: Canvas, stream: str, frame: StereoFrame, cloud: PointClou
     small = colormaps.shrunk(left, int(np.ceil(scale * left.shape[1])))
     view = ViewSpec(Panel.CAMERA, stream, "camera", stream, cloud.frame_id)
     canvas.log_image(f"{view.path}/image", small, view)
-    centre = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
-    canvas.place_camera(view.path, sensor, (camera.fx * scale, camera.fy * scale), centre, small.shape[1::-1])
+    cx, cy = (camera.cx + 0.5) * scale - 0.5, (camera.cy + 0.5) * scale - 0.5
+    matrix = (camera.fx * scale, 0.0, cx), (0.0, camera.fy * scale, cy), (0.0, 0.0, 1.0)
+    lens = fields_of(rr.Pinhole, image_from_camera=matrix, resolution=small.shape[1::-1])
+    place = components_of(rr.Transform3D(translation=sensor.translation, mat3x3=sensor.rotation))
+    canvas.log_components(view.path, rr.Pinhole, place, (*lens, *FRUSTUM))
     plumb = [sensor.translation, sensor.translation * (1.0, 1.0, 0.0)]
     strip = drawn(rr.LineStrips3D, strips=[plumb], colors=[CAMERA_RGB], radii=rr.Radius.ui_points(1.0))
     canvas.log(f"{stream}/plumb", strip, ViewSpec(Panel.CAMERA, stream, "plumb", stream, cloud.frame_id))

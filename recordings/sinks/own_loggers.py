@@ -34,7 +34,7 @@ def log_own(canvas: Canvas, stream: str, item: Any) -> str:
             draw = next(draw for kinds, draw in LOGGERS.items() if len(kinds) == 1 and isinstance(leaf, kinds))
             draw(canvas, spec.path, leaf)
         elif isinstance(leaf, str):
-            canvas.recording.log(spec.path, rr.TextLog(leaf))
+            canvas.log_text(spec.path, leaf)
             canvas.add_view(replace(spec, panel=Panel.OWN_TEXT))
         elif isinstance(leaf, bool | int | float):
             canvas.plot(spec.path, float(leaf), spec)

@@ -6,14 +6,12 @@ errors by default; here they are raised.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import islice
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
@@ -22,8 +20,6 @@ from recordings.atomic_write import give_name, room_to_grow, temporary_name, unw
 from recordings.follower import Follower
 from recordings.sinks.blueprint import (
     APPLICATION,
-    CLOCK,
-    FRAME,
     FRAMES,
     LAYOUT,
     LEDGER,
@@ -36,8 +32,8 @@ from recordings.sinks.blueprint import (
     Panel,
     ViewSpec,
 )  # fmt: skip
-from recordings.sinks.canvas import CURVE_RGB, Canvas, lines_of
-from recordings.sinks.entity_rows import BATCH_BYTES, clocks_of
+from recordings.sinks.canvas import CURVE_RGB, Canvas
+from recordings.sinks.entity_rows import BATCH_BYTES
 from recordings.sinks.loggers import LOGGERS, same_view
 from recordings.sinks.own_loggers import log_own
 from recordings.sinks.own_types import plain_type
@@ -45,7 +41,7 @@ from stages.data import Array, Disparity, ElevationMap, Pose, StereoFrame
 
 RESERVED_BYTES = 64 << 20  # that must stay free; the largest frame and the file's end need less
 MAX_CELL = 60  # characters in a table of the run
-PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers and lines are sent at once, without and with a viewer
+PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers are sent at once, without and with a viewer
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
@@ -61,15 +57,6 @@ def check_room(partial: Path, path: Path) -> None:
         raise unwritable(path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
 
 
-class _Note(NamedTuple):
-    """Numbers of a frame by their paths, and its text in the ledger."""
-
-    stamp: int
-    frame: int
-    values: dict[str, float]
-    lines: list[str]
-
-
 class RerunRecording:
     """A recording that is being written.
 
@@ -83,10 +70,8 @@ class RerunRecording:
         self._viewer: Follower | None = None
         self._stamp = 0  # the latest, ns
         self._frames, self._views = 0, -1
-        self._notes: list[_Note] = []  # of frames, not sent yet
         self._work = Counter[str]()  # stage -> seconds of all frames
         self._loggers: dict[type, list[Callable[..., str | None]]] = {}  # by the type of an item
-        self._plotted: dict[tuple[str, str], str] = {}  # root and stage -> path of its times or queue
         with writing(self._path):
             self._partial.open("wb").close()
         try:
@@ -128,19 +113,22 @@ class RerunRecording:
         """Draw one frame."""
         check_room(self._partial, self._path)
         with catch_and_log_exceptions(strict=True):
-            self._set_clocks(record.stamp, self._frames)
-            self._canvas.rows.stamp, self._canvas.rows.frame = record.stamp, self._frames
+            canvas, self._stamp = self._canvas, max(record.stamp, self._stamp)
+            canvas.at = record.stamp, self._frames
             self._choose_pictures(record.items)
             for stream in record.unchanged:
-                self._canvas.keep_all(stream)
+                canvas.keep_all(stream)
             captions = self._draw(record.items)
-            self._canvas.clear_missing()
-            self._note(record, "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions]))
-            self._log_losses(record.entries, self._frames)
+            self._plot_work(record)
+            canvas.clear_missing()
+            canvas.log_text(FRAMES, "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions]))
+            self._log_losses(record.entries)
             if self._frames or self._viewer is not None:  # a run of one frame sends it at its end only
                 self._send_blueprint()
+            if (self._frames + 1) % (PLOT_BATCH if self._viewer is None else LIVE_BATCH) == 0:
+                canvas.numbers.send()
             if self._viewer is not None:
-                self._canvas.rows.send()
+                canvas.rows.send()
                 self._recording.flush()  # a viewer shows each frame at once
                 self._viewer.grown()
         self._frames += 1
@@ -170,21 +158,19 @@ class RerunRecording:
 
     def _conclude(self, summary: Mapping[str, Any]) -> None:
         """Log the verdict, the remaining losses and the findings."""
-        self._canvas.rows.send()
-        self._send_notes()
-        verdict = str(summary.get("verdict", "INCOMPLETE"))
-        last = max(0, self._frames - 1)
+        verdict, canvas = str(summary.get("verdict", "INCOMPLETE")), self._canvas
         drops = [f"{count} {reason}" for reason, count in dict(summary.get("drops", {})).items()]
-        self._log_losses(summary.get("entries", ()), last)
-        self._set_clocks(self._stamp, last)
+        self._log_losses(summary.get("entries", ()))
+        canvas.at = self._stamp, canvas.at[1]
         level = rr.TextLogLevel.INFO if verdict == "COMPLETE" else rr.TextLogLevel.WARN
         text = f"{verdict}: {counted(self._frames, 'frame')}{''.join(f', {drop}' for drop in drops)}"
-        self._recording.log(LEDGER, rr.TextLog(text, level=level))
+        canvas.log_text(LEDGER, text, level)
         found = [*summary.get("surveys", {}).items(), *summary.get("findings", {}).items()]
         for stream, finding in found:
             level = LEVELS.get(finding["severity"], rr.TextLogLevel.INFO)
-            for line in lines_of(f"{stream}: {finding['sentence']}"):
-                self._recording.log(LEDGER, rr.TextLog(line, level=level))
+            canvas.log_text(LEDGER, f"{stream}: {finding['sentence']}", level)
+        canvas.rows.send()
+        canvas.numbers.send()
         facts = {key: value for key, value in summary.items() if isinstance(value, str | int | float | Mapping)}
         facts.pop("bottleneck", None)
         for key in {"surveys", "findings"} & facts.keys():
@@ -211,12 +197,6 @@ class RerunRecording:
             raise OSError("its end is missing, as after a full disk")
         give_name(self._partial, self._path)
 
-    def _set_clocks(self, stamp: int, frame: int) -> None:
-        """rerun's timelines belong to the calling thread, so every call from outside sets them first."""
-        self._stamp = max(stamp, self._stamp)
-        self._recording.set_time(CLOCK, timestamp=np.datetime64(stamp, "ns"))
-        self._recording.set_time(FRAME, sequence=frame)
-
     def _choose_pictures(self, items: Mapping[str, Any]) -> None:
         """Decide whether this frame's images, clouds and surfaces are drawn, and which streams are no intermediates.
 
@@ -232,9 +212,10 @@ class RerunRecording:
     def _draw(self, items: Mapping[str, Any]) -> list[str]:
         """Log the items of a frame; returns their captions, but for the streams inside a template."""
         present = {stream: items[stream] for stream in self._streams if stream in items}
+        last = {_shown(stream, item): stream for stream, item in present.items()}
         captions = []
         for stream, item in present.items():
-            if _drawn_later(stream, present):
+            if last[_shown(stream, item)] != stream:
                 continue
             if (kind := type(item)) not in self._loggers:
                 fitting = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and issubclass(kind, kinds[0])]
@@ -247,57 +228,22 @@ class RerunRecording:
                     captions.append(log(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
         return [caption for caption in captions if caption]
 
-    def _note(self, record: FrameRecord, text: str) -> None:
-        """Keep the numbers and the line of a frame, to send many frames at once: one by one they would be half of all
-        calls."""
-        values, self._canvas.numbers = self._canvas.numbers, {}
+    def _plot_work(self, record: FrameRecord) -> None:
+        """Plot the times of the stages and their queues; a frame without a stage has a gap in its line."""
         self._work.update(record.seconds)
         for root, numbers in ((SECONDS, record.seconds), (QUEUES, record.queues)):
             for stage, number in numbers.items():
-                if (root, stage) not in self._plotted:
-                    view = ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
-                    self._plotted[root, stage] = view.path
-                    self._canvas.add_view(view)
-                    if root == QUEUES:
-                        self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
-                values[self._plotted[root, stage]] = float(number)
-        self._notes.append(_Note(record.stamp, self._frames, values, lines_of(text)))
-        if len(self._notes) >= (PLOT_BATCH if self._viewer is None else LIVE_BATCH):
-            self._send_notes()
+                view = _stage_view(root, stage)
+                if root == QUEUES and (view.panel, view.path) not in self._canvas.views:
+                    self._recording.log(view.path, rr.SeriesLines(interpolation_mode=STEPS), static=True)
+                self._canvas.log_number(view.path, number, view)
 
-    def _send_notes(self) -> None:
-        """Send the kept numbers and lines; a frame without a stage has a gap in its line."""
-        notes, self._notes = self._notes, []
-        stages = {view.path: None for view in self._canvas.views.values() if view.panel is Panel.STAGE} if notes else {}
-        for path in stages | {path: None for note in notes for path in note.values}:
-            these = notes if path in stages else [note for note in notes if path in note.values]
-            columns = rr.Scalars.columns(scalars=[note.values.get(path, math.nan) for note in these])
-            self._send(path, these, columns)
-        lines = [(note, line) for note in notes for line in note.lines]
-        if lines:
-            levels = [rr.TextLogLevel.INFO] * len(lines)
-            columns = rr.TextLog.columns(text=[line for _, line in lines], level=levels)
-            self._send(FRAMES, [note for note, _ in lines], columns)
-
-    def _send(self, path: str, notes: Sequence[_Note], columns: rr.ComponentColumnList) -> None:
-        clocks = clocks_of([note.stamp for note in notes], [note.frame for note in notes])
-        self._recording.send_columns(path, indexes=clocks, columns=columns, strict=True)
-
-    def _log_losses(self, entries: Iterable[Loss], frame: int) -> None:
+    def _log_losses(self, entries: Iterable[Loss]) -> None:
         """Losses, at their own stamps on the log's clock."""
-        losses = sorted(entries, key=lambda entry: entry.stamp)
-        if not losses:
-            return
-        rows = [
-            (entry.stamp, line)
-            for entry in losses
-            for line in lines_of(f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}")
-        ]
-        stamps, texts = zip(*rows, strict=True)
-        clocks = clocks_of(stamps, [frame] * len(rows))
-        columns = rr.TextLog.columns(text=texts, level=[rr.TextLogLevel.WARN] * len(rows))
-        self._recording.send_columns(LEDGER, indexes=clocks, columns=columns, strict=True)
-        self._stamp = max(losses[-1].stamp, self._stamp)
+        for entry in entries:
+            text = f"{entry.stage} lost {entry.stream}: {entry.reason}. {entry.detail}"
+            self._canvas.log_text(LEDGER, text, rr.TextLogLevel.WARN, (entry.stamp, self._canvas.at[1]))
+            self._stamp = max(entry.stamp, self._stamp)
 
     def _send_blueprint(self) -> None:
         """Send the blueprint again if the frame added a view."""
@@ -305,14 +251,19 @@ class RerunRecording:
             self._views = len(self._canvas.views)
             layout = self._layout()
             for stage, color in zip(layout.slowest, CURVE_RGB, strict=False):
-                path = ViewSpec(Panel.STAGE, SECONDS, rr.escape_entity_path_part(stage), stage).path
-                self._recording.log(path, rr.SeriesLines(colors=[color]), static=True)
+                self._recording.log(_stage_view(SECONDS, stage).path, rr.SeriesLines(colors=[color]), static=True)
             self._canvas.name_curves(SLOWEST, layout.slowest)
             self._recording.send_blueprint(layout.blueprint(self._settings.desk))
 
     def _layout(self) -> Layout:
         slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
         return Layout(tuple(self._canvas.views.values()), tuple(slowest))
+
+
+@cache
+def _stage_view(root: str, stage: str) -> ViewSpec:
+    """The time of a stage, or its queue."""
+    return ViewSpec(Panel.STAGE, root, rr.escape_entity_path_part(stage), stage)
 
 
 def _is(kind: Any, wanted: type) -> bool:
@@ -342,28 +293,21 @@ def _last_of(kind: type, items: Mapping[str, Any]) -> list[str]:
     return streams[-1:]
 
 
-def _drawn_later(stream: str, items: Mapping[str, Any]) -> bool:
-    """Whether a later stream shows the same.
+def _shown(stream: str, item: Any) -> Hashable:
+    """What a picture of an item shows; equal for two streams of which only the later one is drawn.
 
-    That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights
-    and more layers; the very same pose.
+    That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights,
+    to which later stages add layers; the very same pose.
     """
-    mine = items[stream]
-    if not isinstance(mine, Pose | StereoFrame | ElevationMap):
-        return False
-    later = islice(items.values(), list(items).index(stream) + 1, None)
-    if isinstance(mine, Pose):
-        return any(item is mine for item in later)
-    if isinstance(mine, StereoFrame):
-        frames = (item for item in later if isinstance(item, StereoFrame))
-        return any(_same(item.left, mine.left) and _same(item.right, mine.right) for item in frames)
-    maps = (item.layers for item in later if isinstance(item, ElevationMap))
-    return any(mine.layers.keys() <= layers.keys() and _same(layers["elevation"], mine.layers["elevation"])
-               for layers in maps)  # fmt: skip
-
-
-def _same(one: Array, other: Array) -> bool:
-    return bool(one.__array_interface__ == other.__array_interface__)
+    arrays: tuple[Array, ...] = ()
+    match item:
+        case Pose():
+            return id(item)
+        case StereoFrame():
+            arrays = item.left, item.right
+        case ElevationMap():
+            arrays = (item.layers["elevation"],)
+    return tuple((each.ctypes.data, each.shape, each.strides) for each in arrays) or stream
 
 
 def _slowest(bottleneck: Mapping[str, Any]) -> dict[str, str]:

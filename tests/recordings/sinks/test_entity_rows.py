@@ -40,10 +40,9 @@ def test_a_row_lacks_what_it_leaves_out_and_has_nothing_where_it_is_cleared(tmp_
     stream.set_sinks(rr.FileSink(str(tmp_path / "rows.rrd")))
     waiting, form = EntityRows(stream), fields_of(rr.EncodedImage, media_type="image/png")
     for frame, components in enumerate([(blob(rr.EncodedImage, "blob", b"one"), *form), (), ()]):
-        waiting.stamp, waiting.frame = 10 * frame, frame
-        waiting.add("picture", components or (blob(rr.EncodedImage, "blob", np.arange(frame, dtype=np.uint8)),))
-    waiting.stamp, waiting.frame = 30, 3
-    waiting.add("picture", fields_of(rr.EncodedImage, clear_unset=True))
+        row = components or (blob(rr.EncodedImage, "blob", np.arange(frame, dtype=np.uint8)),)
+        waiting.add("picture", (10 * frame, frame), row)
+    waiting.add("picture", (30, 3), fields_of(rr.EncodedImage, clear_unset=True))
     waiting.send()
     stream.disconnect()
     assert rows(tmp_path / "rows.rrd", "/picture", "EncodedImage:media_type") == [(0, 0, ["image/png"]), (30, 3, [])]
@@ -56,9 +55,8 @@ def test_an_entity_is_sent_when_its_rows_are_large_and_others_wait(tmp_path):
     stream.set_sinks(rr.FileSink(str(path)))
     waiting = EntityRows(stream)
     for frame in range(5):
-        waiting.stamp, waiting.frame = 10 * frame, frame
-        waiting.add("large", (blob(rr.EncodedImage, "blob", bytes(BATCH_BYTES // 2)),))
-        waiting.add("small", (blob(rr.EncodedImage, "blob", b"small"),))
+        for name, content in (("large", bytes(BATCH_BYTES // 2)), ("small", b"small")):
+            waiting.add(name, (10 * frame, frame), (blob(rr.EncodedImage, "blob", content),))
     waiting.send()
     stream.disconnect()
     chunks = [chunk.to_record_batch() for chunk in rr.chunk.RrdReader(str(path)).stream()]
