@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import unified_diff
+from heapq import merge
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
 
 from recordings.comparison.measures import Measures, measures
-from recordings.containers.container import LostMessage
+from recordings.containers.container import Channel, LostMessage
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import decoder_for
@@ -122,74 +124,57 @@ def diff(
         check_profile(path, facts)
     found = Diff(facts=_facts(about[one], about[other]))
     with McapFile(one) as first, McapFile(other) as second:
-        readers = _Reader(first), _Reader(second)
-        topics = {topic for reader in readers for topic in reader.topics.values()}
+        logs = first, second
+        topics = {channel.topic for log in logs for channel in log.channels.values() if _is_result(channel)}
         found.topics = {topic: TopicDiff() for topic in _in_order(topics, about[one]["pipeline"])}
-        for change in _changes(*readers, found.topics):
+        for change in _changes(logs, found.topics):
             found.topics[change.topic].add(change)
             on_change(change)
             found.first = found.first or (change.topic, change.stamp)
     return found
 
 
-class _Reader:
-    """Reads the results of a log by groups of one stamp. topics: of the results, by the numbers of their channels."""
+class _Message(NamedTuple):
+    """A message of the first or the second result: 0 or 1."""
 
-    def __init__(self, log: McapFile) -> None:
-        self.log = log
-        channels = log.channels.items()
-        self.topics = {number: channel.topic for number, channel in channels if channel.topic.startswith("/nav/")}
-
-    def groups(self) -> Iterator[tuple[int, dict[str, tuple[int, bytes]]]]:
-        """(Stamp, topic -> number of its channel and bytes)."""
-        for stamp, group in groupby(self.log.messages(set(self.topics)), key=lambda raw: raw.log_time):
-            messages = dict[str, tuple[int, bytes]]()
-            for raw in group:
-                if isinstance(raw, LostMessage):
-                    raise LogError(f"{self.log.path}: {raw.reason}; run the pipeline again")
-                messages[self.topics[raw.channel]] = (raw.channel, bytes(raw.data))
-            yield stamp, messages
-
-    def schema(self, number: int) -> str:
-        schema = self.log.channels[number].schema
-        return "" if schema is None else schema.name
-
-    def decoded(self, number: int, data: bytes) -> Any:
-        schema = self.log.channels[number].schema
-        if schema is None:
-            return data
-        return decoder_for(schema.name, schema.encoding, schema.text)(data)
+    stamp: int
+    result: int
+    channel: Channel
+    data: bytes
 
 
-def _changes(one: _Reader, other: _Reader, topics: Mapping[str, TopicDiff]) -> Iterator[MessageDifference]:
+def _messages(log: McapFile, result: int) -> Iterator[_Message]:
+    """The messages under /nav, in the order of stamps."""
+    for raw in log.messages({number for number, channel in log.channels.items() if _is_result(channel)}):
+        if isinstance(raw, LostMessage):
+            raise LogError(f"{log.path}: {raw.reason}; run the pipeline again")
+        yield _Message(raw.log_time, result, log.channels[raw.channel], bytes(raw.data))
+
+
+def _is_result(channel: Channel) -> bool:
+    return channel.topic.startswith("/nav/")
+
+
+def _changes(logs: Sequence[McapFile], topics: Mapping[str, TopicDiff]) -> Iterator[MessageDifference]:
     """The messages that differ, by stamp and then in the order of `topics`; messages that both have are counted."""
-    for stamp, first, second in _aligned(one.groups(), other.groups()):
-        for topic in topics:
-            a, b = first.get(topic), second.get(topic)
+    messages = merge(*(_messages(log, result) for result, log in enumerate(logs)), key=attrgetter("stamp"))
+    for stamp, group in groupby(messages, key=attrgetter("stamp")):
+        pairs: dict[str, list[_Message | None]] = {topic: [None, None] for topic in topics}
+        for message in group:
+            pairs[message.channel.topic][message.result] = message
+        for topic, (a, b) in pairs.items():
             topics[topic].messages += a is not None and b is not None
-            if (a and a[1]) == (b and b[1]):
+            if (a and a.data) == (b and b.data):
                 continue
-            decoded = [None if item is None else log.decoded(*item) for log, item in ((one, a), (other, b))]
-            values = measures(one.schema(a[0]), *decoded) if a is not None and b is not None else {}
-            yield MessageDifference(topic, stamp, decoded[0], decoded[1], values)
+            one, other = (None if message is None else _decoded(message) for message in (a, b))
+            schema = a.channel.schema if a is not None and b is not None else None
+            values = {} if schema is None else measures(schema.name, one, other)
+            yield MessageDifference(topic, stamp, one, other, values)
 
 
-def _aligned(
-    one: Iterator[tuple[int, dict[str, Any]]], other: Iterator[tuple[int, dict[str, Any]]]
-) -> Iterator[tuple[int, dict[str, Any], dict[str, Any]]]:
-    """(Stamp, group of one, group of the other) of all stamps; a missing group is empty."""
-    a, b = next(one, None), next(other, None)
-    while a is not None or b is not None:
-        if b is None or (a is not None and a[0] < b[0]):
-            assert a is not None  # by the condition of the loop
-            yield a[0], a[1], {}
-            a = next(one, None)
-        elif a is None or b[0] < a[0]:
-            yield b[0], {}, b[1]
-            b = next(other, None)
-        else:
-            yield a[0], a[1], b[1]
-            a, b = next(one, None), next(other, None)
+def _decoded(message: _Message) -> Any:
+    schema = message.channel.schema
+    return message.data if schema is None else decoder_for(schema.name, schema.encoding, schema.text)(message.data)
 
 
 def _in_order(topics: set[str], pipeline: str) -> list[str]:

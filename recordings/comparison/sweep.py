@@ -11,13 +11,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from recordings.comparison.diff import Diff
-from recordings.export.page_layout import INK, PAPER, round_step
+from recordings.export.page_layout import INK, PAPER
 from recordings.png import png
 from stages.data import Array
 
 A_RGB, VARIANT_RGB = (110, 114, 126), (226, 150, 40)
 ROOT = "sweep"
-WIDTH, HEIGHT, LEFT, TOP, BOTTOM = 900, 480, 150, 40, 100  # px of a chart, and of its margins
+WIDTH, HEIGHT, TOP, BOTTOM = 900, 480, 60, 100  # px of a chart, and of its margins
 _FONT, _SIZE = cv2.FONT_HERSHEY_SIMPLEX, 1.1
 
 
@@ -49,41 +49,28 @@ class Sweep:
 
 
 def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Array:
-    """A bar for each value of a setting and a line for A, as an RGB picture; figures: of A, B, ...; NaN = unknown."""
+    """A bar for A and for each value of a setting, with its figure, as an RGB picture; figures: of A, B, ...; NaN =
+    unknown."""
     page = np.full((HEIGHT, WIDTH, 3), PAPER, np.uint8)
-    largest = float(np.nanmax(figures))
-    step = round_step(largest / 2)
-    top, bottom, wide = step * max(1, np.ceil(largest / step)), HEIGHT - BOTTOM, (WIDTH - LEFT - 70) / len(values)
-
-    def row(figure: float) -> int:
-        return int(bottom - figure / top * (bottom - TOP) + 0.5)
-
-    for figure in np.arange(0.0, top + step / 2, step):
-        cv2.line(page, (LEFT, row(figure)), (WIDTH - 70, row(figure)), (214, 214, 210), 2)
-        _text(page, f"{round(figure, 9):,.6g}", (LEFT - 14, row(figure) + 12), 1.0)
-    widest = max(_width(value) for value in values)
-    for number, (value, figure) in enumerate(zip(values, figures[1:], strict=True)):
-        left, right = (round(LEFT + (number + share) * wide) for share in (0.2, 0.8))
-        if np.isnan(figure):
-            _text(page, "unknown" if _width("unknown") < wide else "?", ((left + right) // 2, bottom - 14), 0.5)
-        else:
-            cv2.rectangle(page, (left, row(figure)), (right, bottom), VARIANT_RGB, cv2.FILLED)
-        if number % int(np.ceil((widest + 24) / wide)) == 0:
-            _text(page, value, ((left + right) // 2, bottom + 42), 0.5)
-    if not np.isnan(figures[0]):
-        cv2.line(page, (LEFT, row(figures[0])), (WIDTH - 70, row(figures[0])), A_RGB, 5)
-        _text(page, "A", (WIDTH - 58, row(figures[0]) + 12), 0.0)
-    _text(page, setting, (LEFT + (WIDTH - LEFT - 70) // 2, HEIGHT - 14), 0.5)
+    largest, wide, bottom = float(np.nanmax(figures)), WIDTH / len(figures), HEIGHT - BOTTOM
+    for number, (value, figure) in enumerate(zip(("A", *values), figures, strict=True)):
+        left, right = (round((number + share) * wide) for share in (0.15, 0.85))
+        top, text = bottom, "unknown"
+        if not np.isnan(figure):
+            top = round(bottom - figure / largest * (bottom - TOP))
+            text = f"{figure:,.0f}" if figure >= 1000 else f"{figure:.3g}"
+            cv2.rectangle(page, (left, top), (right, bottom), VARIANT_RGB if number else A_RGB, cv2.FILLED)
+        _text(page, text, (left + right, top - 14), wide)
+        _text(page, value, (left + right, bottom + 42), wide)
+    _text(page, setting, (WIDTH, HEIGHT - 14), WIDTH)
     return page
 
 
-def _width(text: str) -> int:
-    return int(cv2.getTextSize(text, _FONT, _SIZE, 2)[0][0])
-
-
-def _text(page: Array, text: str, at: tuple[int, int], before: float) -> None:
-    """A line of text at a point; before: the share of the text at the left of the point."""
-    cv2.putText(page, text, (round(at[0] - before * _width(text)), at[1]), _FONT, _SIZE, INK, 2, cv2.LINE_AA)
+def _text(page: Array, text: str, at: tuple[int, int], room: float) -> None:
+    """A line of text around half of `at[0]`, smaller where `room` is narrower, px."""
+    width = cv2.getTextSize(text, _FONT, _SIZE, 2)[0][0]
+    size = _SIZE * min(1.0, 0.95 * room / max(1, width))
+    cv2.putText(page, text, (round((at[0] - width * size / _SIZE) / 2), at[1]), _FONT, size, INK, 2, cv2.LINE_AA)
 
 
 def changed(found: Diff) -> dict[str, float]:
