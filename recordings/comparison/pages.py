@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from recordings.comparison.measures import GridLayers, on_one_grid, verdicts_on_one_grid
-from recordings.export.page_layout import Page, add_bar, add_legend, map_page, page_of, with_rover
-from recordings.export.png_pages import disparity_page, relief_page, verdict_page
+from recordings.export.page_layout import Page, add_bar, add_legend, map_page, page_of
+from recordings.export.png_pages import disparity_page, elevation_page, navigation_page
 from recordings.png import png
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_layers, read_occupancy_grid
 from recordings.sinks import colormaps
-from stages.data import Array, Cell, ElevationMap, NavigationMap
+from stages.data import Array, Cell
 
 DISPARITY_LIMIT = 1.0  # px at the ends of the scale
 HEIGHT_LIMIT = 0.05  # m
@@ -70,24 +70,23 @@ def _disparities(one: Any, other: Any) -> tuple[Page, Page, Page] | None:
 
 
 def _elevations(one: Any, other: Any) -> tuple[Page, Page, Page]:
-    maps = [colormaps.terrain_ahead(read_grid_map(message)) for message in (one, other)]
+    maps = [read_grid_map(message) for message in (one, other)]
     grids = on_one_grid(*(GridLayers(item.layers, item.origin, item.resolution) for item in maps))
     first, second = (replace(item, **grid._asdict()) for item, grid in zip(maps, grids, strict=True))
     heights = [grid.layers["elevation"] for grid in grids]
     limits = colormaps.elevation_limits(np.concatenate([layer.ravel() for layer in heights]))
-    page = _map(_change_colors(heights[0], heights[1], HEIGHT_LIMIT), first, "change from A, m")
+    page = map_page(_change_colors(heights[0], heights[1], HEIGHT_LIMIT), first, "change from A, m")
     add_bar(page, -HEIGHT_LIMIT, HEIGHT_LIMIT, lambda values: signed_colors(values, HEIGHT_LIMIT), ONLY_ONE)
-    return relief_page(first, limits), relief_page(second, limits), page
+    return elevation_page(first, limits), elevation_page(second, limits), page
 
 
 def _verdicts(one: Any, other: Any) -> tuple[Page, Page, Page]:
-    maps = (colormaps.navigation_ahead(read_occupancy_grid(message)) for message in (one, other))
-    first, second = verdicts_on_one_grid(*maps)
+    first, second = verdicts_on_one_grid(read_occupancy_grid(one), read_occupancy_grid(other))
     before, after = first.cells, second.cells
     codes = np.select([before == after, after == Cell.FREE, after == Cell.HAZARD], [0, 1, 2], 3)
-    page = _map(colormaps.legend_colors(codes, FLIPS), first, "change from A")
+    page = map_page(colormaps.legend_colors(codes, FLIPS), first, "change from A")
     add_legend(page, FLIPS)
-    return verdict_page(first), verdict_page(second), page
+    return navigation_page(first), navigation_page(second), page
 
 
 def _change_colors(one: Array, other: Array, limit: float) -> Array:
@@ -96,12 +95,6 @@ def _change_colors(one: Array, other: Array, limit: float) -> Array:
     for code, known in ((1, np.isfinite(one) & np.isnan(other)), (2, np.isnan(one) & np.isfinite(other))):
         rgb[known] = ONLY_ONE[code][1]
     return rgb
-
-
-def _map(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Page:
-    """A page of a map's cells."""
-    extended, corner = with_rover(rgb, grid, colormaps.UNKNOWN_RGB)
-    return map_page(extended, grid.resolution, corner, f"{title} ({grid.frame_id})")
 
 
 PAGES: Mapping[str, Callable[[Any, Any], tuple[Page, Page, Page] | None]] = {

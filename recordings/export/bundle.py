@@ -26,7 +26,6 @@ from recordings.export.geotiff import write_geotiff
 from recordings.export.map_server import write_pgm, write_yaml
 from recordings.export.mosaic import STRIP_ROWS, Mosaic
 from recordings.export.point_files import CELL_COLOR, add_colors, write_cells, write_points
-from recordings.export.tum import tum_texts
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.result_log import without_results
@@ -213,10 +212,16 @@ class MapFiles:
 
 
 def _export_poses(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
-    """The poses in each frame of reference; those of two have no distance."""
-    texts = tum_texts(result, lost)
-    folders = _folders(texts)
-    return [_write(out / folders[name] / "poses.tum", Path.write_text, text) for name, text in texts.items()]
+    """The poses in each frame of reference, as TUM files: stamp in seconds, x y z, quaternion x y z w in a line."""
+    lines: dict[str, list[str]] = {}
+    for _, stamp, message in iter_decoded(result, ["/nav/pose"], lost):
+        place, turn = message.pose.pose.position, message.pose.pose.orientation
+        numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
+        seconds = f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}"
+        line = f"{seconds} {' '.join(f'{number:.9g}' for number in numbers)}\n"
+        lines.setdefault(message.header.frame_id, []).append(line)
+    folders = _folders(lines)
+    return [_write(out / folders[name] / "poses.tum", Path.write_text, "".join(own)) for name, own in lines.items()]
 
 
 def _export_region(

@@ -44,25 +44,24 @@ def page_of(picture: Array, title: str, beside: int = 3) -> Page:
     return page
 
 
-def with_rover(
-    rgb: Array, grid: ElevationMap | NavigationMap, unknown: tuple[int, int, int]
-) -> tuple[Array, tuple[float, float]]:
-    """A grid (rows, cols, 3) in frame `level`, extended by unknown cells to the rover at (0, 0); and its origin."""
+def _with_rover(rgb: Array, grid: ElevationMap | NavigationMap) -> tuple[Array, tuple[float, float]]:
+    """Cells (rows, cols, 3) in frame `level`, extended by unknown ones to the rover at (0, 0); and their origin."""
     if grid.frame_id != LEVEL_FRAME:
         return rgb, grid.origin
     (x, y), step = grid.origin, grid.resolution
     first = [min(0, math.floor(-at / step + _MAX_OFFSET)) for at in (y, x)]
     last = [max(size, math.ceil(-at / step - _MAX_OFFSET)) for at, size in zip((y, x), rgb.shape[:2], strict=True)]
-    extended = np.full((last[0] - first[0], last[1] - first[1], 3), unknown, np.uint8)
+    extended = np.full((last[0] - first[0], last[1] - first[1], 3), colormaps.UNKNOWN_RGB, np.uint8)
     extended[-first[0] :, -first[1] :][: rgb.shape[0], : rgb.shape[1]] = rgb
     return extended, (round(x + first[1] * step, 6), round(y + first[0] * step, 6))
 
 
-def map_page(rgb: Array, resolution: float, origin: tuple[float, float], title: str) -> Page:
-    """A grid (rows, cols, 3) as a bird's-eye view, with x at its left and y below it at every second metre."""
-    rows, cols = rgb.shape[:2]
+def map_page(rgb: Array, grid: ElevationMap | NavigationMap, title: str) -> Page:
+    """Cells (rows, cols, 3) of a map as a bird's-eye view, with x at its left and y below it at every second metre."""
+    rgb, origin = _with_rover(rgb, grid)
+    resolution, (rows, cols) = grid.resolution, rgb.shape[:2]
     zoom = max(1, MAX_MAP_PX // max(rows, cols))
-    page = page_of(colormaps.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), title)
+    page = page_of(colormaps.birds_eye(rgb).repeat(zoom, 0).repeat(zoom, 1), f"{title} ({grid.frame_id})")
     margin = page.margin
     bottom, right, unit = margin + cols * zoom, margin + rows * zoom, margin / 64
     for x in _ticks(origin[0], cols * resolution):

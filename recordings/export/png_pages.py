@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.export.page_layout import Page, add_bar, add_legend, map_page, page_of, with_rover
+from recordings.export.page_layout import Page, add_bar, add_legend, map_page, page_of
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.png import png
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from recordings.sinks import colormaps
-from stages.data import Array, Cell, ElevationMap, NavigationMap
+from stages.data import Array, ElevationMap, NavigationMap
 
 
 def draw(result: Path, out: Path) -> list[Path]:
@@ -51,31 +51,18 @@ def disparity_page(disparity: Array, limit: float | None = None) -> Page:
     return page
 
 
-def elevation_page(terrain: ElevationMap) -> Page:
-    """Shaded relief of a terrain as an RGB page with coordinates and a colour bar."""
-    terrain = colormaps.terrain_ahead(terrain)
-    return relief_page(terrain, colormaps.elevation_limits(terrain.layers["elevation"]))
-
-
-def relief_page(terrain: ElevationMap, limits: tuple[float, float]) -> Page:
-    """The same of all of a terrain, with a colour bar over `limits`, m."""
-    low, high = limits
-    rgb, origin = with_rover(colormaps.elevation_colors(terrain, (low, high)), terrain, colormaps.UNKNOWN_RGB)
-    page = map_page(rgb, terrain.resolution, origin, f"elevation, m ({terrain.frame_id})")
+def elevation_page(terrain: ElevationMap, limits: tuple[float, float] | None = None) -> Page:
+    """Shaded relief of a terrain as an RGB page with coordinates and a colour bar over `limits`, m."""
+    low, high = limits or colormaps.elevation_limits(terrain.layers["elevation"])
+    page = map_page(colormaps.elevation_colors(terrain, (low, high)), terrain, "elevation, m")
     add_bar(page, low, high, lambda values: colormaps.apply_palette(values, low, high, cv2.COLORMAP_VIRIDIS))
     return page
 
 
 def navigation_page(navigation: NavigationMap) -> Page:
     """A navigation map as an RGB page with coordinates and a legend."""
-    return verdict_page(colormaps.navigation_ahead(navigation))
-
-
-def verdict_page(navigation: NavigationMap) -> Page:
-    """The same of all of a navigation map."""
     colors = colormaps.legend_colors(navigation.cells, colormaps.CELL_LEGEND)
-    rgb, origin = with_rover(colors, navigation, colormaps.CELL_LEGEND[Cell.UNKNOWN][1])
-    page = map_page(rgb, navigation.resolution, origin, f"navigation map ({navigation.frame_id})")
+    page = map_page(colors, navigation, "navigation map")
     add_legend(page, colormaps.CELL_LEGEND)
     return page
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
@@ -17,10 +16,9 @@ from recordings.comparison.text import format_diff, moment
 from recordings.errors import LogError
 from recordings.export.bundle import MapFiles
 from recordings.export.page_layout import Page
-from recordings.export.png_pages import PAGES, relief_page, verdict_page
+from recordings.export.png_pages import PAGES, elevation_page, navigation_page
 from recordings.reporting.figures import MAX_WIDTH, line_plot, picture, track_plot
 from recordings.reporting.run_facts import RunFacts, read_facts
-from recordings.sinks.colormaps import elevation_limits
 from recordings.sinks.overwrite import REPORT
 from stages.data import ElevationMap, NavigationMap
 
@@ -124,12 +122,12 @@ def _region_pages(maps: MapFiles) -> Iterator[tuple[str, Page]]:
     if (terrain := maps.elevation) is not None:
         heights, size = terrain.overview("elevation", MAX_WIDTH)
         grid = ElevationMap(maps.stamp, {"elevation": heights}, size, terrain.origin, terrain.frame_id)
-        yield "elevation", relief_page(grid, elevation_limits(heights))
+        yield "elevation", elevation_page(grid)
     if (navigation := maps.navigation) is not None:
         cells, size = navigation.overview("cells", MAX_WIDTH)
         reason = np.zeros(cells.shape, np.uint8)
         verdicts = NavigationMap(maps.stamp, cells, reason, size, navigation.origin, navigation.frame_id)
-        yield "navigation", verdict_page(verdicts)
+        yield "navigation", navigation_page(verdicts)
 
 
 def _plots(facts: Sequence[RunFacts], names: Sequence[str]) -> str:
@@ -170,17 +168,5 @@ def _losses(facts: RunFacts) -> str:
 def _parameters(facts: RunFacts) -> str:
     changes = facts.about.get("overrides", "")
     shown = f"<p>Changes:</p><pre>{escape(changes)}</pre>" if changes else "<p>No changes to the pipeline.</p>"
-    files = _files(facts.about.get("pipeline", ""))
-    return shown + "".join(
-        f"<details><summary>{escape(name)}</summary><pre>{escape(text)}</pre></details>" for name, text in files.items()
-    )
-
-
-def _files(pipeline: str) -> dict[str, str]:
-    """Name -> text of the pipeline file and of its templates, which stand at its end as comments."""
-    main, *templates = re.split(r"^# (?=\S+\.ya?ml:$)", pipeline, flags=re.MULTILINE)
-    found = {"Pipeline": main}
-    for text in templates:
-        name, _, lines = text.partition(":\n")
-        found[f"Template {name}"] = re.sub("^# ?", "", lines, flags=re.MULTILINE)
-    return found
+    pipeline = escape(facts.about.get("pipeline", ""))
+    return f"{shown}<details><summary>Pipeline, and its templates as comments</summary><pre>{pipeline}</pre></details>"

@@ -6,7 +6,7 @@ import pytest
 
 from recordings.comparison.pages import FLIPS, ONLY_ONE, pages
 from recordings.export.page_layout import page_of
-from recordings.export.png_pages import relief_page, verdict_page
+from recordings.export.png_pages import elevation_page, navigation_page
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from recordings.sinks import colormaps
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap
@@ -34,9 +34,9 @@ def test_maps_of_other_extent_and_height_are_drawn_on_one_grid_with_one_scale():
     limits = colormaps.elevation_limits(
         np.concatenate([whole["elevation"].ravel(), np.ravel(other.layers["elevation"])])
     )
-    expected = relief_page(ElevationMap(STAMP, whole, 0.5, (1.0, -2.0), "odom"), limits)
+    expected = elevation_page(ElevationMap(STAMP, whole, 0.5, (1.0, -2.0), "odom"), limits)
     np.testing.assert_array_equal(drawn[0].pixels, expected.pixels)
-    np.testing.assert_array_equal(drawn[1].pixels, relief_page(other, limits).pixels)
+    np.testing.assert_array_equal(drawn[1].pixels, elevation_page(other, limits).pixels)
     assert drawn[2].pixels.shape == expected.pixels.shape
     assert (drawn[2].pixels == ONLY_ONE[2][1]).all(2).mean() > 0.2
 
@@ -46,7 +46,7 @@ def test_maps_of_other_cells_lie_on_each_other():
     drawn = pages(GRID, occupancy_grid(coarse), occupancy_grid(fine))
     assert drawn is not None
     np.testing.assert_array_equal(
-        drawn[0].pixels, verdict_page(navigation(np.kron(coarse.cells, np.ones((2, 2), np.int8)))).pixels
+        drawn[0].pixels, navigation_page(navigation(np.kron(coarse.cells, np.ones((2, 2), np.int8)))).pixels
     )
     freed, same = ((drawn[2].pixels == FLIPS[code][1]).all(2).sum() for code in (1, 0))
     assert freed == pytest.approx(same / 3, rel=0.05)
