@@ -125,8 +125,7 @@ def read_layout(recording: Path) -> Layout:
 def _overview(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """All of it: images, space, maps, plots and the ledger."""
     above = _row((_images(drawn), 6.4), (_space(drawn), 5.6), (_maps(drawn), 4.0))
-    below = _below(drawn, slowest)
-    return below if above is None else rrb.Vertical(above, below, row_shares=[3.1, 1.0])
+    return _shared(rrb.Vertical, "row_shares", (above, 3.1), (_below(drawn, slowest), 1.0)) or _ledger(drawn)
 
 
 def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
@@ -141,7 +140,7 @@ def _matching(drawn: Specs, slowest: Sequence[str]) -> _Part:
         *(_tabs(_flat_views(drawn, panel)) for panel in (Panel.CONFIDENCE, Panel.SIGMA)),
         _panel(drawn, Panel.MATCHES, MATCHED, in_tab=False),
     ]  # fmt: skip
-    return _grid(parts, 4) or _ledger(drawn)
+    return _held(rrb.Grid, parts, grid_columns=4) or _ledger(drawn)
 
 
 def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
@@ -154,23 +153,25 @@ def _terrain(drawn: Specs, slowest: Sequence[str]) -> _Part:
         _tabs([*_flat_views(drawn, Panel.REASON), *regional]), *shown,
         _tabs(view for view in layers if view not in shown),
     ]  # fmt: skip
-    return _row((_grid(flat, 3), 5.0), (_space(drawn), 3.0)) or _ledger(drawn)
+    return _row((_held(rrb.Grid, flat, grid_columns=3), 5.0), (_space(drawn), 3.0)) or _ledger(drawn)
 
 
 def _runtime(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """Times of stages and sinks, queues, and all that was lost."""
-    plots = _stack(map(_tabs, _stage_plots(drawn, slowest)))
-    texts = _stack([*_texts(drawn)[:2], _summary()])
+    plots = _held(rrb.Vertical, map(_tabs, _stage_plots(drawn, slowest)))
+    texts = _held(rrb.Vertical, [*_texts(drawn)[:2], _summary()])
     return _row((plots, 3.0), (texts, 2.0)) or _ledger(drawn)
 
 
 def _tilt(drawn: Specs, slowest: Sequence[str]) -> _Part:
     """The readings, their residuals in the images, and the cloud that is levelled by them."""
     plots = [_panel(drawn, panel, title, in_tab=False) for panel, title in SENSOR_PLOTS]
-    space = _stack([*_image_tabs(drawn)[:1], _tabs(_spaces(drawn, Panel.CLOUD, "cloud")), _tabs(_trajectories(drawn))])
+    space = _held(
+        rrb.Vertical,
+        [*_image_tabs(drawn)[:1], _tabs(_spaces(drawn, Panel.CLOUD, "cloud")), _tabs(_trajectories(drawn))],
+    )
     rows = [(plots[0], 3.0), (plots[1], 4.0), (plots[3], 2.0), (_ledger(drawn), 3.0)]  # the check's angles are small
-    present = [(part, share) for part, share in rows if part is not None]
-    right = rrb.Vertical(*(part for part, _ in present), row_shares=[share for _, share in present])
+    right = _shared(rrb.Vertical, "row_shares", *rows)
     return _row((space, 2.0), (right, 3.0)) or _ledger(drawn)
 
 
@@ -183,17 +184,20 @@ DESKS: dict[str, Callable[[Specs, Sequence[str]], _Part]] = {
 }
 
 
-def _row(*columns: tuple[_Part | None, float]) -> _Part | None:
-    """Parts beside each other, each with its share of the width."""
-    present = [(part, share) for part, share in columns if part is not None]
-    if not present:
-        return None
-    return rrb.Horizontal(*[part for part, _ in present], column_shares=[share for _, share in present])
-
-
-def _grid(parts: Iterable[_Part | None], columns: int) -> _Part | None:
+def _held(container: type[rrb.Container], parts: Iterable[_Part | None], **options: Any) -> _Part | None:
+    """The parts that there are in a container; a single one as it is; None for none."""
     present = [part for part in parts if part is not None]
-    return rrb.Grid(*present, grid_columns=columns) if present else None
+    return container(*present, **options) if len(present) > 1 else next(iter(present), None)
+
+
+def _shared(container: type[rrb.Container], shares: str, *parts: tuple[_Part | None, float]) -> _Part | None:
+    """The same of parts with their shares of the room."""
+    present = [(part, share) for part, share in parts if part is not None]
+    return _held(container, [part for part, _ in present], **{shares: [share for _, share in present]})
+
+
+def _row(*columns: tuple[_Part | None, float]) -> _Part | None:
+    return _shared(rrb.Horizontal, "column_shares", *columns)
 
 
 def _at(drawn: Specs, *panels: Panel) -> list[ViewSpec]:
@@ -201,16 +205,8 @@ def _at(drawn: Specs, *panels: Panel) -> list[ViewSpec]:
 
 
 def _tabs(views: Iterable[_Part | None]) -> _Part | None:
-    """Several views as tabs, the first one shown; a single view as it is; None for none."""
-    parts = [view for view in views if view is not None]
-    if len(parts) < 2:
-        return parts[0] if parts else None
-    return rrb.Tabs(*parts, active_tab=0)
-
-
-def _stack(parts: Iterable[_Part | None]) -> _Part | None:
-    present = [part for part in parts if part is not None]
-    return rrb.Vertical(*present) if len(present) > 1 else (present[0] if present else None)
+    """Several views as tabs, the first one shown."""
+    return _held(rrb.Tabs, views, active_tab=0)
 
 
 def _flat_views(drawn: Specs, *panels: Panel) -> list[rrb.View]:
@@ -248,7 +244,7 @@ def _images(drawn: Specs) -> _Part | None:
     rows = [present[first : first + 2] for first in range(0, len(present), 2)]
     if len(rows) > 1 and len(rows[-1]) == 1:  # no place stays empty
         rows[-2:] = [rows[-2] + rows[-1]]
-    return _stack(rrb.Horizontal(*row) if len(row) > 1 else row[0] for row in rows)
+    return _held(rrb.Vertical, (_held(rrb.Horizontal, row) for row in rows))
 
 
 def _image_tabs(drawn: Specs) -> list[_Part | None]:
@@ -270,7 +266,7 @@ def _space(drawn: Specs) -> _Part | None:
     """For each frame of reference the clouds and the terrains, both with the cameras; and the trajectory so far."""
     clouds = _tabs([*_spaces(drawn, Panel.CLOUD, "cloud"), *_spaces(drawn, Panel.VOXELS, "voxels")])
     terrains = _tabs([*_spaces(drawn, Panel.TERRAIN, "terrain"), *_trajectories(drawn)])
-    return _stack([clouds, terrains])
+    return _held(rrb.Vertical, [clouds, terrains])
 
 
 def _spaces(drawn: Specs, panel: Panel, name: str) -> list[rrb.View]:
@@ -303,7 +299,7 @@ def _trajectories(drawn: Specs) -> list[rrb.View]:
 def _maps(drawn: Specs) -> _Part | None:
     reliefs, layers = _flat_views(drawn, Panel.RELIEF), _flat_views(drawn, Panel.LAYER)
     maps, reasons = _flat_views(drawn, Panel.MAP), _flat_views(drawn, Panel.REASON)
-    return _stack([_tabs([*reliefs, *layers]), _tabs([*maps, *reasons])])
+    return _held(rrb.Vertical, [_tabs([*reliefs, *layers]), _tabs([*maps, *reasons])])
 
 
 def _plot(specs: Iterable[ViewSpec], title: str, **options: Any) -> rrb.View | None:
