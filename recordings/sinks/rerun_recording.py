@@ -294,7 +294,7 @@ def _last_of(kind: type, items: Mapping[str, Any]) -> list[str]:
 
 
 def _shown(stream: str, item: Any) -> Hashable:
-    """What a picture of an item shows; equal for two streams of which only the later one is drawn.
+    """What a picture of an item shows. Of streams that show the same the last one is drawn.
 
     That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights,
     to which later stages add layers; the very same pose.
