@@ -58,7 +58,7 @@ class Clean(Stage):
 
     @property
     def _crop(self) -> float:
-        return self.max_range + self.margin
+        return float(self.max_range + self.margin)
 
     def _organised(self, cloud: PointCloud) -> Array:
         """Mask of the points kept by their neighbours in the image; points not measured are only cropped."""
@@ -86,7 +86,7 @@ class Clean(Stage):
         write_depths(cloud.points, cloud.sigma, cloud.pixel, far, math.inf, inverse, tolerance)
         patch, sizes = connected_patches(inverse, tolerance, MAX_SLOPE_RATIO * median_slope(inverse))
         chosen = (sizes >= MIN_PATCH_SHARE * len(kept)) & ~out_of_order(inverse, patch, sizes)
-        return kept[chosen.take(patch.ravel().take(cloud.pixel.take(kept)))]
+        return np.asarray(kept[chosen.take(patch.ravel().take(cloud.pixel.take(kept)))])
 
     def _knn(self, cloud: PointCloud) -> Array:
         """Indices of the points kept by the mean distance to their nearest neighbours in space."""

@@ -18,7 +18,7 @@ _DIRECTIONS = ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1,
 OFFSETS = np.array(
     [(ring * dv, ring * du) for ring in range(1, RINGS + 1) for dv, du in _DIRECTIONS], dtype=np.int32
 )  # fmt: skip
-MAX_DEVIATIONS = 3.0  # standard deviations of noise between two neighbours of one surface
+EXPLAINED = 3.0 * np.sqrt(2.0)  # standard deviations of noise between two neighbours of one surface
 MAX_SLOPE_RATIO = 2.0  # steepest slope of a surface over the scene's median slope
 MIN_AGREEING_SHARE = 0.3  # of the up to 32 neighbours in the image
 MIN_NEIGHBOURS = 4  # with fewer a point cannot be judged and is dropped
@@ -40,22 +40,26 @@ def supported(
     slope = np.float32(MAX_SLOPE_RATIO * median_slope(inverse[inside]))
     agreed = np.zeros(shape, np.bool_)
     _agree(inverse, tolerance, OFFSETS, slope, np.float32(MIN_AGREEING_SHARE), agreed)
-    rays = pixel_rays(points, pixel, chosen, int(shape[1]))
     kept = np.empty(len(chosen), np.int64)
-    kept = kept[: _keep(points, sigma, pixel, chosen, agreed.reshape(-1), rays, inverse[inside], kept)]
-    return kept, inverse[inside], tolerance[inside]
+    return kept[: _keep(pixel, chosen, agreed, inverse[inside], kept)], inverse[inside], tolerance[inside]
 
 
-def write_depths(
-    points: Array, sigma: Array, pixel: Array, chosen: Array, max_range: float, inverse: Array, tolerance: Array
-) -> None:
+@kernel
+def write_depths(points, sigma, pixel, chosen, max_range, inverse, tolerance):
     """Write the inverse depths of the points `chosen`, 1/m, and the differences that noise explains, into two images.
 
     points: (N, 3) float32 in the camera's frame, m; sigma: (N,) float32, depth standard deviation, m; pixel: (N,)
-    int32; chosen: (M,) int64; max_range: m from the camera, of the points that are written; into inverse, tolerance:
-    (H, W) float32.
+    int32; chosen: (M,) int64; max_range: float, m from the camera, of the points that are written; into inverse,
+    tolerance: (H, W) float32.
     """
-    _write_depths(points, sigma, pixel, chosen, MAX_DEVIATIONS * np.sqrt(2.0), float(max_range), inverse, tolerance)
+    width = inverse.shape[1]
+    for i in chosen:
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        if z > 0.0 and x * x + y * y + z * z <= max_range * max_range:
+            row = pixel[i] // width
+            col = pixel[i] - row * width
+            own = 1.0 / z
+            inverse[row, col], tolerance[row, col] = own, EXPLAINED * sigma[i] * own * own
 
 
 def median_slope(inverse: Array) -> float:
@@ -67,39 +71,6 @@ def median_slope(inverse: Array) -> float:
     change = np.abs(inverse[12::4, ::4] - inverse[:-12:4, ::4])
     change = change[np.isfinite(change)]
     return float(np.median(change)) / 12 if len(change) else 0.0
-
-
-def pixel_rays(points: Array, pixel: Array, chosen: Array, width: int) -> Array:
-    """The lines x/z = a + b * column and y/z = a + b * row on which a cloud's points lie, robust to gross errors.
-
-    Theil-Sen: the median slope between points half a sample apart, over an evenly spaced sample of at most 4000 of the
-    `chosen` points. Returns (4,) float64, a and b of the columns, a and b of the rows; all NaN if the points do not
-    determine them.
-    """
-    sample = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 4000)).astype(np.int64)]
-    sample = sample[points[sample, 2] > 0]
-    rays = np.full(4, np.nan)
-    for axis, index in ((0, pixel[sample] % width), (1, pixel[sample] // width)):
-        half = len(sample) // 2
-        step = index[half : 2 * half] - index[:half]
-        ratio = points[sample, axis].astype(np.float64) / points[sample, 2]
-        if not np.any(step):
-            return np.full(4, np.nan)
-        slope = np.median((ratio[half : 2 * half] - ratio[:half])[step != 0] / step[step != 0])
-        rays[2 * axis : 2 * axis + 2] = np.median(ratio - slope * index), slope
-    return rays
-
-
-@kernel
-def _write_depths(points, sigma, pixel, chosen, factor, max_range, inverse, tolerance):
-    width = inverse.shape[1]
-    for i in chosen:
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        if z > 0.0 and x * x + y * y + z * z <= max_range * max_range:
-            row = pixel[i] // width
-            col = pixel[i] - row * width
-            own = 1.0 / z
-            inverse[row, col], tolerance[row, col] = own, factor * sigma[i] * own * own
 
 
 @kernel
@@ -128,18 +99,13 @@ def _agree(inverse, tolerance, offsets, slope, share, agreed):
 
 
 @kernel
-def _keep(points, sigma, pixel, chosen, agreed, rays, inverse, kept):
-    """Keep the points that agree and lie on their pixel's line of sight, erase the others, and return their number."""
-    width = inverse.shape[1]
-    count = 0
+def _keep(pixel, chosen, agreed, inverse, kept):
+    """Keep the points that agree, erase the others, and return the number kept."""
+    width, count = inverse.shape[1], 0
     for i in chosen:
         row = pixel[i] // width
         col = pixel[i] - row * width
-        own = 1.0 / np.float64(points[i, 2])
-        aside = 2.0 * abs(rays[1]) + 3.0 * sigma[i] * own
-        across = abs(points[i, 0] * own - rays[0] - rays[1] * col)
-        down = abs(points[i, 1] * own - rays[2] - rays[3] * row)
-        if agreed[pixel[i]] and not (across > aside or down > aside):
+        if agreed[row, col]:
             kept[count] = i
             count += 1
         else:
@@ -157,17 +123,13 @@ def supported_reference(
     inverse = np.full(shape, np.nan, np.float32)
     inverse.ravel()[pixel[near]] = 1 / p[near, 2]
     slope = MAX_SLOPE_RATIO * median_slope(inverse)
-    rays = pixel_rays(points, pixel, np.arange(len(points)), shape[1])
     row, col = np.divmod(pixel, shape[1])
     own = 1 / np.where(near, p[:, 2], np.nan)
-    aside = 2 * abs(rays[1]) + 3 * sigma * own
-    off_ray = np.abs(p[:, 0] * own - rays[0] - rays[1] * col) > aside
-    off_ray |= np.abs(p[:, 1] * own - rays[2] - rays[3] * row) > aside
     padded = np.pad(inverse, RINGS, constant_values=np.nan)
     present, agreeing = np.zeros(len(p), int), np.zeros(len(p), int)
     for k, (dv, du) in enumerate(OFFSETS):
         difference = np.abs(padded[row + dv + RINGS, col + du + RINGS] - own)
         present += np.isfinite(difference)
-        agreeing += difference <= MAX_DEVIATIONS * np.sqrt(2) * sigma * own**2 + slope * (k // 8 + 1)
+        agreeing += difference <= EXPLAINED * sigma * own**2 + slope * (k // 8 + 1)
     agreed = (present >= MIN_NEIGHBOURS) & (agreeing >= MIN_AGREEING_SHARE * present)
-    return chosen[near & ~off_ray & agreed]  # type: ignore[no-any-return]
+    return chosen[near & agreed]  # type: ignore[no-any-return]

@@ -16,16 +16,6 @@ from stages.data import Array
 _MAX_STEP = 4  # px to the next point: a cloud may contain only every 4th pixel
 
 
-def connected_patches(inverse: Array, tolerance: Array, slope: float) -> tuple[Array, Array]:
-    """Labels of the patches, (H, W) int32: numbers in the order of their first pixels, -1 without a point; and the
-    number of points of each patch, (K,) int32.
-
-    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference explained by
-    noise, 1/m (of two points the larger one applies); slope: further difference allowed per pixel of distance, 1/m.
-    """
-    return _connected_patches(inverse, tolerance, float(slope))  # type: ignore[no-any-return]
-
-
 @part
 def _linked(inverse, tolerance, slope, row, col, up, left):
     """Flat index of the next point above or to the left if it is linked to this one, else -1."""
@@ -41,7 +31,13 @@ def _linked(inverse, tolerance, slope, row, col, up, left):
 
 
 @kernel
-def _connected_patches(inverse, tolerance, slope):
+def connected_patches(inverse, tolerance, slope):
+    """Labels of the patches, (H, W) int32: numbers in the order of their first pixels, -1 without a point; and the
+    number of points of each patch, (K,) int32.
+
+    inverse: (H, W) float32, inverse depth, 1/m, NaN = no point; tolerance: (H, W) float32, difference explained by
+    noise, 1/m (of two points the larger one applies); slope: float, further difference per pixel of distance, 1/m.
+    """
     height, width = inverse.shape
     parent = np.empty(height * width, np.int32)
     begun = own = 0

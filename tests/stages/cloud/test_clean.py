@@ -73,16 +73,6 @@ def test_a_subsampled_cloud_is_cleaned_as_well(stride):
     assert (~kept[inside & ~floats[take]]).mean() <= 0.005
 
 
-def test_points_off_their_pixel_rays_are_dropped():
-    cloud = cloud_with_noise()
-    lifted = np.random.default_rng(4).random(len(cloud.points)) < 0.01
-    points = cloud.points - np.where(lifted, 0.5, 0)[:, None].astype(np.float32) * LEVEL_FROM_CAMERA[2] * -1
-    kept = np.isin(cloud.pixel, Clean()(replace(cloud, points=points.astype(np.float32))).pixel)
-    inside = np.linalg.norm(points, axis=1) < 9
-    assert (~kept[lifted]).mean() >= 0.98
-    assert (~kept[inside & ~lifted]).mean() <= 0.005
-
-
 def test_a_speck_of_nine_pixels_is_dropped_and_a_rock_is_kept():
     d, rock = rocks_seen(ROCK), rocks_seen(ROCK) - rocks_seen(()) > 1.0
     d[300:303, 100:103] *= 2
