@@ -21,7 +21,7 @@ from stages.terrain.fused_map import FusedMap, Observation, cells_of, merged, va
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
 from stages.terrain.map_levelling import MapLevelling, StatedErrors
-from stages.terrain.map_region import MARGIN, map_around
+from stages.terrain.map_region import map_around
 from stages.terrain.map_registration import FrameGrid, frame_grid, plane_between, register, with_plane
 
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
@@ -266,17 +266,11 @@ class Fuse(_Fusion):
     (8.025, 0.0)
     """
 
-    window: float = parameter(20.0, "width of the map returned with each frame", unit="m", low=0.5, high=400.0)
+    window: float = parameter(20.0, "least width of the map of each frame", unit="m", low=0.5, high=400.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_cells("Fuse.window", self.window, self.resolution)
-        min_window = 2 * (self.max_range + MARGIN)
-        if self.window < min_window:
-            raise ValueError(
-                f"Fuse.window must be at least {min_window:g} m, not {self.window:g} m: it contains all that a frame "
-                f"changes (max_range, {self.max_range:g} m) and {MARGIN:g} m around it"
-            )
 
     def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> ElevationMap:
         """The map around the rover, in the pose's frame, with a cloud in frame `level` merged in."""

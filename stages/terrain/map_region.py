@@ -11,13 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data import ElevationMap, Region
+from stages.data import RIM_WIDTH, ElevationMap, Region
 from stages.stage import Stage, check_cells, parameter
 from stages.terrain.fused_map import layers_of
 
 AHEAD = (4.0, 0.0, 0.0)  # m in frame `level`; the place that moves when the rover turns
 MAX_GAP = 20.0  # m from one frame to the next that one map spans
-MARGIN = 1.5  # m; the slope and step of a cell depend on cells this near
 
 Bounds = tuple[int, int, int, int]  # first row and column, end row and column
 
@@ -88,7 +87,7 @@ class MapRegion(Stage):
 def map_around(region: Region, window: float, changed: Bounds) -> ElevationMap:
     """The map of `window`, m, around the rover, and around what has changed."""
     step, half = region.resolution, math.ceil(window / 2 / region.resolution - 1e-9)
-    margin = math.ceil(MARGIN / step - 1e-9)
+    margin = math.ceil(RIM_WIDTH / step - 1e-9)
     col, row = (math.floor(position / step) - half for position in region.level.translation[:2])
     first_row, first_col, end_row, end_col = changed
     wide = first_row - margin, first_col - margin, end_row + margin, end_col + margin

@@ -39,17 +39,22 @@ def test_a_rock_seen_from_two_headings_keeps_its_place():
     assert (x[rock].mean(), y[rock].mean()) == (pytest.approx(1.0, abs=0.01), pytest.approx(2.0, abs=0.01))
 
 
-def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch):
+def give_ceilings(monkeypatch, *heights):
+    """Give each frame a ceiling of its height in the unknown cells up to 3 m from its rover."""
+    heights = iter(heights)
+
     def hiding(*arguments):
         frame = frame_grid(*arguments)
-        x, y = centres(frame.terrain)
-        looked = np.hypot(x, y) < 3
-        ceiling = np.where(~frame.known & looked, next(heights), np.nan).astype(np.float32)
+        hidden = ~frame.known & (np.hypot(*centres(frame.terrain)) < 3)
+        ceiling = np.where(hidden, next(heights), np.nan).astype(np.float32)
         return replace(frame, terrain=replace(frame.terrain, layers={**frame.terrain.layers, "ceiling": ceiling}))
 
-    heights = iter((-0.2, -0.1))
     use_whole_frames(monkeypatch)
     monkeypatch.setattr("stages.terrain.fuse.frame_grid", hiding)
+
+
+def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch):
+    give_ceilings(monkeypatch, -0.2, -0.1)
     _, terrain = fused(drive(frame, flat, at=(0.0, 0.0, 1.2 * frame)) for frame in range(2))
     assert [cell(terrain, *place, "occluded") for place in ((1.02, 0.02), (2.52, 0.02), (1.02, 2.22))] == [1, 0, 0]
     assert np.isnan(cell(terrain, -5.0, 0.02, "occluded"))
@@ -59,14 +64,8 @@ def test_cells_hidden_from_all_frames_differ_from_cells_out_of_view(monkeypatch)
 
 
 def test_the_ceiling_of_a_frame_is_aligned_with_its_cells(monkeypatch):
-    def hiding(*arguments):
-        frame = frame_grid(*arguments)
-        ceiling = np.where(frame.known, np.nan, next(ceilings)).astype(np.float32)
-        return replace(frame, terrain=replace(frame.terrain, layers={**frame.terrain.layers, "ceiling": ceiling}))
-
-    use_whole_frames(monkeypatch)
-    monkeypatch.setattr("stages.terrain.fuse.frame_grid", hiding)
-    ceilings, first, (cloud, pose) = iter((np.nan, -0.14)), *(drive(n, flat, at=(0.0, 0.0, 0.0)) for n in range(2))
+    give_ceilings(monkeypatch, np.nan, -0.14)
+    first, (cloud, pose) = (drive(n, flat, at=(0.0, 0.0, 0.0)) for n in range(2))
     raised = replace(pose, position=pose.position + np.array([0, 0, 0.06]))
     _, terrain = fused([first, (cloud, raised)])
     assert cell(terrain, 4.02, 0.02) == pytest.approx(0, abs=0.002)
@@ -246,9 +245,7 @@ def test_a_map_of_a_log_is_not_continued_from_another_place():
             fuse(cloud, replace(pose, position=pose.position + shift), MOUNT, state=state)
 
 
-def test_a_small_window_and_a_range_of_too_many_cells_are_refused():
-    with pytest.raises(ValueError, match=r"Fuse\.window must be at least 19 m, not 15 m"):
-        Fuse(max_range=8.0, window=15.0)
+def test_a_range_of_too_many_cells_is_refused():
     with pytest.raises(ValueError, match=r"^FuseRegion\.max_range = 150 m makes a map 6000 cells"):
         FuseRegion(max_range=150.0)
 
