@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from stages.data import Array, MatchFailure, PointCloud
-from stages.terrain.kernels.grid import Grid, shade_statistics
+from stages.terrain.kernels.grid import Grid, cell_statistics
 
 MAX_DARK = 32.0  # gray levels, an eighth of the range; unlit ground is darker
 MIN_BURNT_OUT = 250.0  # gray levels
@@ -20,9 +20,11 @@ MIN_BARE_PIXELS = 4  # fewer have no contrast that could be measured
 def match_failure(cloud: PointCloud, grid: Grid) -> Array:
     """Codes of `MatchFailure` of the cells that contain points of a cloud of filled pixels, (rows, cols) float64, else
     NaN."""
-    shades = shade_statistics(cloud.points, cloud.colors, grid)
-    found = shades[:, :, 0] > 0
-    count, total, squares = shades[found].T
+    shades = cloud.points.astype(np.float64)
+    shades[:, 2] = cloud.colors @ np.ones(3) / 3
+    figures = cell_statistics(shades, cloud.sigma, grid)
+    found = figures[:, :, 0] > 0
+    count, total, squares = figures[found, :3].T
     mean = total / count
     contrast = np.sqrt(np.maximum(squares / count - mean * mean, 0.0))
     bare = (contrast <= MAX_BARE_CONTRAST) & (count >= MIN_BARE_PIXELS)

@@ -11,15 +11,6 @@ from stages.compiled.jit import kernel, part
 from stages.data import Array
 
 
-def gradient_and_curvature(heights: Array) -> Array:
-    """Rise per cell along columns (x) and rows (y), and height above the mean of the neighbours.
-
-    heights: (rows, cols) float64, NaN = unknown. Returns (3, rows, cols) float64, NaN where the cell is unknown and 0
-    without neighbours.
-    """
-    return _gradient_and_curvature(np.ascontiguousarray(heights))  # type: ignore[no-any-return]
-
-
 @part
 def _known(value):
     return 0.0 if np.isnan(value) else value
@@ -45,7 +36,12 @@ def gradient_at(heights, row, col):
 
 
 @kernel
-def _gradient_and_curvature(heights):
+def gradient_and_curvature(heights):
+    """Rise per cell along columns (x) and rows (y), and height above the mean of the neighbours.
+
+    heights: (rows, cols) float64, NaN = unknown. Returns (3, rows, cols) float64, NaN where the cell is unknown and 0
+    without neighbours.
+    """
     result = np.full((3, *heights.shape), np.nan)
     for row in range(heights.shape[0]):
         for col in range(heights.shape[1]):

@@ -131,33 +131,6 @@ def cell_statistics_reference(points: Array, sigma: Array, grid: Grid) -> Array:
     return cells.reshape(*grid.shape, 6)
 
 
-def shade_statistics(points: Array, colors: Array, grid: Grid) -> Array:
-    """Number, sum and sum of squares of the gray values in each cell, (rows, cols, 3) float64.
-
-    points: (N, 3) float32, m; colors: (N, 3) uint8. The gray value is the mean of the three channels.
-    """
-    shades = np.zeros((*grid.shape, 3))
-    _shade_statistics(np.ascontiguousarray(points), np.ascontiguousarray(colors), grid.raster, shades)
-    return shades
-
-
-@kernel
-def _shade_statistics(points, colors, raster, shades):
-    for i in range(points.shape[0]):
-        row, col = cell_of(np.float64(points[i, 0]), np.float64(points[i, 1]), raster)
-        if row >= 0:
-            gray = (np.float64(colors[i, 0]) + np.float64(colors[i, 1]) + np.float64(colors[i, 2])) / 3.0
-            shades[row, col, 0] += 1.0
-            shades[row, col, 1] += gray
-            shades[row, col, 2] += gray * gray
-
-
-def shade_statistics_reference(points: Array, colors: Array, grid: Grid) -> Array:
-    """The same as `shade_statistics`, in plain numpy."""
-    gray = np.column_stack([points[:, :2], colors.mean(axis=1)])
-    return cell_statistics_reference(gray, np.zeros(len(points)), grid)[:, :, :3]
-
-
 def cells_of(points: Array, grid: Grid) -> tuple[Array, Array]:
     """Flat cell index of the points on the grid, and which points those are, (N,) bool."""
     p, rows, cols = points.astype(np.float64), *grid.shape
