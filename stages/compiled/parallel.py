@@ -12,8 +12,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
-from stages.data import Array
-
 BANDS = 8  # of rows: few enough to cost nothing, enough that neither thread waits long for the other
 Fork = Callable[[Callable[[], Any], Callable[[], Any]], tuple[Any, Any]]
 
@@ -72,9 +70,3 @@ def by_bands(run_both: Fork, rows: int, work: Callable[[int, int], Any]) -> None
             work(first, end)
 
     run_both(take, take)
-
-
-def with_margin(image: Array, first: int, end: int, margin: int) -> tuple[Array, slice]:
-    """Rows first to end of an image with up to `margin` more on either side, and the slice of first to end in them."""
-    start = max(first - margin, 0)
-    return image[start : end + margin], slice(first - start, end - start)

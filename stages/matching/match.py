@@ -35,7 +35,6 @@ RANGE_TOLERANCE = 2.0  # px; a prior farther outside the search range shows that
 MAX_BYTE, MAX_COST = 255, 59  # of the sums of paths, and of the cost
 P2_EDGE_SCALE = 10.0  # gray levels, the step of brightness that halves p2
 MAX_PRIOR_DISTANCE = 4.0  # px, from which the prior's cost grows no more
-SPECKLE_RANGE = 1.0  # px, the disparity step that separates patches
 SearchArea = SearchWindows | list[Range]
 
 
@@ -279,8 +278,8 @@ class Match(Stage):
         return SgmParams(
             diagonals=self.paths == 8, p1=self.p1, p2_table=np.minimum(falling, self.p2).astype(np.uint8),
             unseen_cost=self.unseen_cost, disparities=len(search), min_disparity=search.start,
-            uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance, speckle_range=SPECKLE_RANGE,
-            max_speckle_size=self.max_speckle_size, confidence_of=confidence, keep_costs=self.keep_costs,
+            uniqueness=self.uniqueness, lr_tolerance=self.lr_tolerance, max_speckle_size=self.max_speckle_size,
+            confidence_of=confidence, keep_costs=self.keep_costs,
         )  # fmt: skip
 
 

@@ -192,30 +192,53 @@ def raw_costs(left, right, inputs, unseen_cost, x, i, width):
     return bit_or(minus_capped(cost, outside), bit_and(outside, broadcast(unseen_cost, width)))
 
 
+def raw_costs_reference(left: Array, right: Array, partner: Array, unseen_cost: int) -> Array:
+    """The costs of pixels at some partners, not smoothed, (H, W, n) int64, in plain numpy.
+
+    left, right: (H, 5, W) uint8, not mirrored; partner: (H, W, n), columns, which may be outside the right image.
+    """
+    columns = right.shape[2]
+    inside = (partner >= 0) & (partner < columns)
+    rows = np.arange(len(right))[:, np.newaxis, np.newaxis]
+    there = right.transpose(1, 0, 2)[:, rows, np.where(inside, partner, 0)]
+    here = left.transpose(1, 0, 2)[..., np.newaxis]
+    bits = np.bitwise_count(here[:DX] ^ there[:DX]).sum(axis=0, dtype=np.int64)
+    step = np.abs(here[DX:].astype(int) - there[DX:]).sum(axis=0)
+    return np.where(inside, 2 * bits + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE), unseen_cost)
+
+
+def smoothed_reference(raw: Array, searched: Array, slope: Array, beyond: int) -> Array:
+    """Means of raw costs (H, W, n) over 3x3 pixels, along the slope (H, W), in plain numpy.
+
+    searched: (H, W, n) bool; a pixel's own cost stands in for neighbours that were not. beyond: the cost of a neighbour
+    beyond either end of the range, or -1, which counts as not searched.
+    """
+
+    def neighbours(costs: Array, axis: int) -> tuple[Array, Array]:
+        pad = [(int(axis == k),) * 2 for k in range(3)]
+        wide = np.where(np.pad(searched, pad, mode="edge"), np.pad(costs, pad, mode="edge"), -1)
+        length = costs.shape[axis]
+        pair = wide.take(range(length), axis), wide.take(range(2, length + 2), axis)
+        if axis == 0:
+            for y, x in zip(*np.nonzero(slope), strict=True):
+                for row, later in zip(pair, (slope[y, x], -slope[y, x]), strict=True):
+                    row[y, x] = np.pad(row[y, x], 1, constant_values=beyond)[1 - later :][: raw.shape[2]]
+        one, other = (np.where(row < 0, costs, row) for row in pair)
+        return one, other
+
+    west, east = neighbours(raw, 1)
+    three = west + raw + east
+    up, down = neighbours(three, 0)
+    mean = ((up + down + 1) // 2 + three + 1) // 2
+    return np.where(searched, ((mean + 1) // 2 + 1) // 2, NOT_SEARCHED)
+
+
 def smoothed_costs_reference(
     left: Array, right: Array, lanes: int, minimum: int, unseen_cost: int, slope: Array | None = None
 ) -> Array:
-    """All costs, (H, W, lanes) uint8, in plain numpy.
-
-    left, right: (H, 5, W) uint8, not mirrored; slope: (H, W), of `steep_slope`.
-    """
+    """All costs, (H, W, lanes) uint8, in plain numpy. left, right: (H, 5, W) uint8, not mirrored."""
     height, _, columns = left.shape
-    raw = np.full((height, columns, lanes), unseen_cost)
-    for x in range(columns):
-        for lane in range(lanes):
-            partner = x - minimum - lane
-            if 0 <= partner < columns:
-                bits = np.bitwise_count(left[:, :DX, x] ^ right[:, :DX, partner]).sum(axis=1, dtype=np.int64)
-                step = np.abs(left[:, DX:, x].astype(np.int64) - right[:, DX:, partner]).sum(axis=1)
-                raw[:, x, lane] = 2 * bits + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
-    wide = np.pad(raw, ((0, 0), (1, 1), (0, 0)), mode="edge")
-    three = np.pad(wide[:, :-2] + wide[:, 1:-1] + wide[:, 2:], ((1, 1), (0, 0), (0, 0)), mode="edge")
-    above, below = three[:-2].copy(), three[2:].copy()
-    slope = np.zeros(raw.shape[:2], np.int8) if slope is None else slope
-    for y, x in zip(*np.nonzero(slope), strict=True):
-        rise = slope[y, x]
-        for row, later in ((above, rise), (below, -rise)):
-            row[y, x] = np.pad(row[y, x], 1, constant_values=NOT_SEARCHED)[1 - later : 1 - later + lanes]
-    mean = ((above + below + 1) // 2 + three[1:-1] + 1) // 2
-    result: Array = (((mean + 1) // 2 + 1) // 2).astype(np.uint8)
-    return result
+    partner = np.arange(columns)[:, np.newaxis] - minimum - np.arange(lanes)
+    raw = raw_costs_reference(left, right, np.broadcast_to(partner, (height, *partner.shape)), unseen_cost)
+    slope = np.zeros((height, columns), np.int8) if slope is None else slope
+    return smoothed_reference(raw, np.ones(raw.shape, bool), slope, NOT_SEARCHED).astype(np.uint8)

@@ -21,19 +21,14 @@ def halved(image: Array) -> Array:
     return half
 
 
-def doubled(small: Array, height: int, width: int) -> Array:
+@kernel
+def doubled(small, height, width):
     """A disparity image at double size with doubled values, (height, width) float32, px, NaN = unknown.
 
     small: (H, W) float32, of half the size, rounded up.
     """
     large = np.empty((height, width), np.float32)
-    _double(small, large)
-    return large
-
-
-@kernel
-def _double(small, large):
-    (rows, columns), (height, width) = small.shape, large.shape
+    rows, columns = small.shape
     last = columns - 1
     for y in range(height):
         row, beside = small[y >> 1], small[min(max((y >> 1) + (y & 1) * 2 - 1, 0), rows - 1)]
@@ -47,6 +42,7 @@ def _double(small, large):
             target[2 * last] = _between(row, beside, last, max(last - 1, 0))
             if 2 * last + 1 < width:
                 target[2 * last + 1] = _between(row, beside, last, last)
+    return large
 
 
 @inlined_part

@@ -98,18 +98,13 @@ def _count(prior, top, end, minimum, counts):
                 counts[np.int64(min(max(place, np.float32(0)), last))] += 1
 
 
-def count_in_rows(pixels: Array, source: Array, near: np.float32, reach: np.float32) -> Array:
+@kernel
+def count_in_rows(pixels, source, near, reach):
     """The pixels of each row below `near`, the known ones, and those measured above `reach`: (3, H) int64.
 
-    pixels: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`.
+    pixels: (H, W) float32, px, NaN = unknown; source: (H, W) uint8, codes of `PixelOrigin`; near, reach: float32.
     """
-    counts = np.zeros((3, len(pixels)), np.int64)
-    _count_in_rows(pixels, source, near, reach, counts)
-    return counts
-
-
-@kernel
-def _count_in_rows(pixels, source, near, reach, counts):
+    counts = np.zeros((3, pixels.shape[0]), np.int64)
     for y in range(pixels.shape[0]):
         far, known, reached = np.int32(0), np.int32(0), np.int32(0)
         for x in range(np.uint64(pixels.shape[1])):
@@ -118,6 +113,7 @@ def _count_in_rows(pixels, source, near, reach, counts):
             known += np.int32(np.isfinite(d))
             reached += np.int32((d > reach) & (source[y, x] == MEASURED))
         counts[0, y], counts[1, y], counts[2, y] = far, known, reached
+    return counts
 
 
 def count_in_rows_reference(pixels: Array, source: Array, near: np.float32, reach: np.float32) -> Array:

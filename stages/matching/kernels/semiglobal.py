@@ -105,7 +105,7 @@ def match(
             drop_unmatchable(contrast(left, first, end), contrast(right, first, end), *rows)
 
         by_bands(run_both, len(left), drop)
-        drop_speckles(pixels, evidence, source, params.speckle_range, params.max_speckle_size, space, run_both)
+        drop_speckles(pixels, evidence, source, params.max_speckle_size, space, run_both)
     return Matches(pixels, source, cv2.LUT(evidence, params.confidence_of), costs if params.keep_costs else None)
 
 

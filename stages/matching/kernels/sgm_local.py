@@ -32,8 +32,7 @@ from stages.compiled.simd import (
 from stages.compiled.workspace import Workspace
 from stages.data import Array
 from stages.matching.kernels.aggregation import NOT_SEARCHED, aggregate_reference, next_path
-from stages.matching.kernels.census import PLANES
-from stages.matching.kernels.gradient import MAX_GRADIENT_DIFFERENCE, raw_costs
+from stages.matching.kernels.gradient import raw_costs, raw_costs_reference, smoothed_reference
 from stages.matching.kernels.matching_inputs import MatchingInputs
 from stages.matching.kernels.selection import costs_reference, find_winner, fit_row, keep_costs, select_reference
 from stages.matching.kernels.sgm_params import SgmParams
@@ -282,8 +281,11 @@ def match_windows_reference(inputs: MatchingInputs, params: SgmParams, windows: 
     searched = np.zeros((*first.shape, int(lanes.max()) + 1), bool)
     np.put_along_axis(searched, lanes, True, axis=2)
     costs = np.full(searched.shape, NOT_SEARCHED)
-    np.put_along_axis(costs, lanes, _raw_costs_reference(inputs, params, first, n), axis=2)
-    costs = _smoothed_reference(costs, searched, inputs.slope)
+    columns = first.shape[1]
+    partner = np.arange(columns)[:, np.newaxis] - first[..., np.newaxis] - np.arange(n)
+    planes = inputs.left[:, :, :columns], inputs.right[:, :, :columns][:, :, ::-1]
+    np.put_along_axis(costs, lanes, raw_costs_reference(*planes, partner, params.unseen_cost), axis=2)
+    costs = smoothed_reference(costs, searched, inputs.slope, -1)
     pull = inputs.prior_costs[inputs.prior[..., np.newaxis] + np.arange(n)]
     np.put_along_axis(costs, lanes, np.minimum(np.take_along_axis(costs, lanes, axis=2) + pull, 255), axis=2)
     sums = sum(aggregate_reference(inputs.steps, params, costs, searched, sign) for sign in (1, -1))
@@ -291,38 +293,3 @@ def match_windows_reference(inputs: MatchingInputs, params: SgmParams, windows: 
     rows = [select_reference(total[y], first[y], int(first.min()), n, params) for y in range(first.shape[0])]
     costs = np.stack([costs_reference(row) for row in total], axis=1)
     return [*(np.stack(layer) for layer in zip(*rows, strict=True)), costs]
-
-
-def _raw_costs_reference(inputs: MatchingInputs, params: SgmParams, first: Array, n: int) -> Array:
-    """The costs in the windows, not smoothed, (H, W, n) int64."""
-    height, columns = first.shape
-    partner = columns - 1 - np.arange(columns)[:, np.newaxis] + first[..., np.newaxis] + np.arange(n)
-    left = inputs.left[:, :, :columns].transpose(1, 0, 2)[..., np.newaxis]
-    right = inputs.right.transpose(1, 0, 2)[:, np.arange(height)[:, np.newaxis, np.newaxis], partner]
-    bits = np.bitwise_count(left[:PLANES] ^ right[:PLANES]).sum(axis=0, dtype=np.int64)
-    step = np.abs(left[PLANES:].astype(int) - right[PLANES:]).sum(axis=0)
-    raw = 2 * bits + 5 * np.minimum(step, MAX_GRADIENT_DIFFERENCE)
-    return np.where(inputs.outside[partner] > 0, params.unseen_cost, raw)
-
-
-def _smoothed_reference(raw: Array, searched: Array, slope: Array) -> Array:
-    """Means over 3x3 pixels; a pixel's own cost stands in for neighbours that were not searched."""
-
-    def neighbours(costs: Array, axis: int) -> tuple[Array, Array]:
-        pad = [(int(axis == k),) * 2 for k in range(3)]
-        wide = np.where(np.pad(searched, pad, mode="edge"), np.pad(costs, pad, mode="edge"), -1)
-        length = costs.shape[axis]
-        pair = wide.take(range(length), axis), wide.take(range(2, length + 2), axis)
-        if axis == 0:
-            for y, x in zip(*np.nonzero(slope), strict=True):
-                for row, later in zip(pair, (slope[y, x], -slope[y, x]), strict=True):
-                    row[y, x] = np.pad(row[y, x], 1, constant_values=-1)[1 - later :][: raw.shape[2]]
-        one, other = (np.where(row < 0, costs, row) for row in pair)
-        return one, other
-
-    west, east = neighbours(raw, 1)
-    three = west + raw + east
-    up, down = neighbours(three, 0)
-    mean = ((up + down + 1) // 2 + three + 1) // 2
-    smoothed: Array = np.where(searched, ((mean + 1) // 2 + 1) // 2, NOT_SEARCHED)
-    return smoothed

@@ -18,7 +18,6 @@ class SgmParams(NamedTuple):
     min_disparity: int
     uniqueness: int
     lr_tolerance: int
-    speckle_range: float
     max_speckle_size: int
     confidence_of: Array  # (256,) float32, confidence for each value of the evidence
     keep_costs: bool

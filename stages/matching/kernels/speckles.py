@@ -1,8 +1,8 @@
 """Speckle removal: small isolated patches of the disparity image are dropped.
 
-A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by at most
-`step`. The trick: union-find joins runs, stretches of a row without a larger step, instead of pixels. A row has a
-hundred times fewer runs than pixels, and a patch is dropped run by run.
+A patch is a set of pixels joined through neighbours (left, right, above, below) whose disparities differ by at most 1
+px. The trick: union-find joins runs, stretches of a row without a larger step, instead of pixels. A row has a hundred
+times fewer runs than pixels, and a patch is dropped run by run.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ from stages.compiled.workspace import Workspace
 from stages.data import Array, PixelOrigin
 
 SPECKLE = int(PixelOrigin.SPECKLE)
+STEP = np.float32(1)  # px, of disparity between two pixels of a patch
 
 
 def drop_speckles(
-    disparity: Array, evidence: Array, source: Array, step: float, max_size: int, space: Workspace,
-    run_both: Fork = in_turn,
+    disparity: Array, evidence: Array, source: Array, max_size: int, space: Workspace, run_both: Fork = in_turn
 ) -> None:  # fmt: skip
     """Set patches of at most `max_size` pixels to NaN, their evidence to 0 and their source to SPECKLE, in place.
 
-    disparity: (H, W) float32, px, NaN = unknown; evidence, source: (H, W) uint8; step: px; space: memory for the runs;
-    run_both: calls two functions, on one thread or two.
+    disparity: (H, W) float32, px, NaN = unknown; evidence, source: (H, W) uint8; space: memory for the runs; run_both:
+    calls two functions, on one thread or two.
     """
     if max_size == 0:
         return
-    columns, limit = disparity.shape[1], np.float32(step)
+    columns = disparity.shape[1]
     space.reserve(4 * (4 * disparity.size + 64))
     # There are at most as many runs as pixels. Pages that are not touched take no memory.
     runs = tuple(space.array((disparity.size,), np.int32) for _ in ("start", "end", "parent", "area"))
@@ -39,7 +39,7 @@ def drop_speckles(
 
     def find(first: int, end: int) -> None:
         seams, goes_on = np.full((2, columns), -1, np.int32), np.zeros(columns + 1, np.bool_)
-        bands[first] = _find_runs(disparity, first, end, limit, runs, seams, goes_on), seams
+        bands[first] = _find_runs(disparity, first, end, runs, seams, goes_on), seams
 
     def drop(first: int, _: int) -> None:
         layers = disparity.reshape(-1), evidence.reshape(-1), source.reshape(-1)
@@ -47,12 +47,12 @@ def drop_speckles(
 
     by_bands(run_both, len(disparity), find)
     for upper, lower in itertools.pairwise(sorted(bands)):
-        _join_bands(disparity, lower, limit, runs, bands[upper][1][1], bands[lower][1][0])
+        _join_bands(disparity, lower, runs, bands[upper][1][1], bands[lower][1][0])
     by_bands(run_both, len(disparity), drop)
 
 
 @kernel
-def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
+def _find_runs(disparity, first_row, end_row, runs, seams, goes_on):
     """Write the runs of some rows, joined with each other, from index first_row * W on; return the end index.
 
     A run that is its own parent has the area of its patch, in pixels.
@@ -66,7 +66,7 @@ def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
     for y in range(first_row, end_row):
         row, origin, above_end = disparity[y], y * columns, count
         for x in range(1, columns):
-            goes_on[x] = abs(row[x] - row[x - 1]) <= step
+            goes_on[x] = abs(row[x] - row[x - 1]) <= STEP
         x = 0
         while x < columns:
             first = x
@@ -81,7 +81,7 @@ def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
             other = above
             while other < above_end and start[other] + columns < end[count]:
                 for i in range(max(start[other] + columns, start[count]), min(end[other] + columns, end[count])):
-                    if abs(pixels[i] - pixels[i - columns]) <= step:
+                    if abs(pixels[i] - pixels[i - columns]) <= STEP:
                         join(parent, count, other)
                         break
                 other += 1
@@ -99,11 +99,11 @@ def _find_runs(disparity, first_row, end_row, step, runs, seams, goes_on):
 
 
 @kernel
-def _join_bands(disparity, y, step, runs, above, below):
+def _join_bands(disparity, y, runs, above, below):
     """Join the runs of row y - 1, `above`, and of row y, `below`, pixel by pixel."""
     _, _, parent, area = runs
     for x in range(disparity.shape[1]):
-        if above[x] >= 0 and below[x] >= 0 and abs(disparity[y, x] - disparity[y - 1, x]) <= step:
+        if above[x] >= 0 and below[x] >= 0 and abs(disparity[y, x] - disparity[y - 1, x]) <= STEP:
             upper, lower = root(parent, above[x]), root(parent, below[x])
             if upper != lower:
                 join(parent, upper, lower)
@@ -122,15 +122,15 @@ def _drop(pixels, strength, source, runs, first, last, max_size):
                 pixels[i], strength[i], source[i] = np.nan, 0, SPECKLE
 
 
-def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, step: float, max_size: int) -> None:
+def drop_speckles_reference(disparity: Array, evidence: Array, source: Array, max_size: int) -> None:
     """`drop_speckles` by the connected components of a graph of pixels."""
     from scipy.sparse import coo_array  # takes long to import
     from scipy.sparse.csgraph import connected_components
 
     index = np.arange(disparity.size).reshape(disparity.shape)
     with np.errstate(invalid="ignore"):
-        beside = np.abs(np.diff(disparity, axis=1)) <= np.float32(step)
-        above = np.abs(np.diff(disparity, axis=0)) <= np.float32(step)
+        beside = np.abs(np.diff(disparity, axis=1)) <= STEP
+        above = np.abs(np.diff(disparity, axis=0)) <= STEP
     first = np.concatenate([index[:, :-1][beside], index[:-1][above]])
     second = np.concatenate([index[:, 1:][beside], index[1:][above]])
     graph = coo_array((np.ones(len(first), np.uint8), (first, second)), shape=(index.size, index.size))

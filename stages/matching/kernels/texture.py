@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import fast_kernel, kernel
-from stages.compiled.parallel import by_bands, shared_by, with_margin
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array, PixelOrigin, StereoFrame
 from stages.matching.intensity import gray_pair
 
@@ -199,8 +199,10 @@ def contrast(image: Array, first: int, end: int) -> Array:
 
     image: (H, W) uint8.
     """
-    rows, own = with_margin(image, first, end, WINDOW // 2)
-    return np.asarray(cv2.morphologyEx(rows, cv2.MORPH_GRADIENT, np.ones((WINDOW, WINDOW), np.uint8))[own])
+    start = max(first - WINDOW // 2, 0)
+    rows = image[start : end + WINDOW // 2]
+    found = cv2.morphologyEx(rows, cv2.MORPH_GRADIENT, np.ones((WINDOW, WINDOW), np.uint8))
+    return np.asarray(found[first - start : end - start])
 
 
 @kernel
@@ -243,12 +245,9 @@ def information_reference(image: Array, slopes: Array, noise: Array) -> Array:
     """`information` in plain numpy and float64."""
     square = np.square(noise[image].astype(np.float64))
     seen = (np.square(slopes.astype(np.float64)) - NOISE_GAIN * square) / (2 * GRADIENT_GAIN**2 * square)
-    rows, cols = (-(-extent // BLOCK) for extent in image.shape)
-    layers = np.empty((2, rows, cols))
-    for j, i in np.ndindex(rows, cols):
-        block = seen[j * BLOCK : (j + 1) * BLOCK, i * BLOCK : (i + 1) * BLOCK]
-        layers[:, j, i] = block.sum(), block.size
-    return layers
+    rows, cols = (np.arange(0, extent, BLOCK) for extent in image.shape)
+    layers = np.stack([seen, np.ones_like(seen)])
+    return np.add.reduceat(np.add.reduceat(layers, rows, axis=1), cols, axis=2)
 
 
 def without_noise_reference(image: Array, variance: Array) -> Array:

@@ -6,10 +6,9 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 
-from stages.compiled.parallel import BANDS, at_once, by_bands, in_turn, shared_by, with_margin
+from stages.compiled.parallel import BANDS, at_once, by_bands, in_turn, shared_by
 
 
 def test_both_results_come_back_and_from_two_threads_if_there_are_two():
@@ -71,15 +70,6 @@ def test_the_other_thread_takes_the_bands_of_a_busy_one():
 
     by_bands(at_once, BANDS, work)
     assert done[-1] == 0
-
-
-@pytest.mark.parametrize("margin", [0, 2, 50])
-def test_the_margin_of_a_band_ends_with_the_image(margin):
-    image = np.arange(40)
-    for first, end in ((0, 5), (1, 9), (17, 20), (38, 40)):
-        about, own = with_margin(image, first, end, margin)
-        assert about.tolist() == list(range(max(first - margin, 0), min(end + margin, 40)))
-        assert about[own].tolist() == list(range(first, end))
 
 
 @pytest.mark.parametrize("both", [in_turn, at_once])

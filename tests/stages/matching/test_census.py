@@ -31,7 +31,7 @@ def rows_smoothed(inputs, unseen_cost, costs, sums, step, width):
 
 def params_of(disparities, minimum):
     nothing = np.zeros(256, np.uint8)
-    return SgmParams(True, 9, nothing, 11, disparities, minimum, 0, 1, 1.0, 0, nothing.astype(np.float32), True)
+    return SgmParams(True, 9, nothing, 11, disparities, minimum, 0, 1, 0, nothing.astype(np.float32), True)
 
 
 def planes_of(image):

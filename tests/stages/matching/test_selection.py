@@ -59,11 +59,11 @@ def test_speckles_are_the_small_components_of_a_graph(height, columns, largest, 
     evidence = np.where(np.isfinite(disparity), 9, 0).astype(np.uint8)
     source = np.where(evidence > 0, PixelOrigin.MEASURED, PixelOrigin.LEFT_RIGHT).astype(np.uint8)
     wanted = disparity.copy(), evidence.copy(), source.copy()
-    drop_speckles_reference(*wanted, 1.0, largest)
+    drop_speckles_reference(*wanted, largest)
     for threads in (1, 2):
         found = disparity.copy(), evidence.copy(), source.copy()
 
-        drop_speckles(*found, 1.0, largest, Workspace(), shared_by(threads))
+        drop_speckles(*found, largest, Workspace(), shared_by(threads))
         np.testing.assert_equal(found, wanted)
 
 
