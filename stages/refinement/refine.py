@@ -23,7 +23,7 @@ from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.refinement.kernels.label_origin import Trust, label_origin
 from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
-from stages.refinement.kernels.plane_fit import INLIER_DISTANCE, Planes, fit_planes
+from stages.refinement.kernels.plane_fit import Planes, fit_planes
 from stages.refinement.kernels.region_merging import merge_regions
 from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
@@ -39,8 +39,6 @@ MAX_GRADIENT = 0.5  # px/px, of an accepted plane
 MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
 MAX_FILL_DISTANCE = 64.0  # px to a disparity that fills a hole; of an occlusion any distance
 MAX_EXTRAPOLATION = 16  # px that holes are filled beyond the last match, at the border or towards the sky
-DEPTH_EDGE = 1.0  # px between neighbours at an edge of depth
-EDGE_COLOUR = 15.0  # levels of colour over which a neighbour's weight falls to 1/e there
 # Fitted to eight Middlebury scenes and simulated frames, which count alike; tests/study.py prints the true shares.
 TRUST = Trust(
     agreed=(0.955, 0.993, 0.998),
@@ -150,7 +148,7 @@ class Refine(Stage):
         sharp = self._sharpened(self._bilateral(filled, guide), guessed, *alike(image, other))
         refined, sigma, consistent = self._supported(sharp, guessed, frame)
         source, confidence = label_origin(
-            matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, INLIER_DISTANCE, TRUST,
+            matches, disparity.confidence, agreed, kinds, refined, consistent, reasons, sigma, TRUST
         )  # fmt: skip
         stated = sigma if self.support else None
         return Disparity(frame.stamp, refined, source, confidence, labels, frame.camera, stated)
@@ -237,7 +235,7 @@ class Refine(Stage):
     def _sharpened(self, pixels: Array, guessed: Array, image: Array, other: Array) -> Array:
         if self.edge_radius == 0:
             return pixels
-        return sharpen_edges(pixels, guessed, image, other, self.edge_radius, DEPTH_EDGE, EDGE_COLOUR, self.threads)
+        return sharpen_edges(pixels, guessed, image, other, self.edge_radius, self.threads)
 
 
 def _saturated(image: Array, guide: Array, level: int) -> Array:

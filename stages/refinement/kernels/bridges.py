@@ -24,15 +24,6 @@ RADIUS = 1  # rows above and below whose images count
 PARTS = np.int64(16)  # of a pixel; whole numbers sum to the same in any order
 
 
-def bridge_holes(disparity: Array, filled: Array, kinds: Array, left: Array, right: Array) -> tuple[Array, Array]:
-    """`filled` and `kinds` with bridges, which have the kind `BRIDGE`; both arrays are changed.
-
-    disparity: (H, W) float32, px, NaN = hole; filled, kinds: as `fill_holes` returns them; left, right: (H, W) uint8.
-    """
-    _bridge(disparity, left, right, filled, kinds)
-    return filled, kinds
-
-
 @part
 def _difference(left, right, y, x, disparity):
     """The difference of the images at a pixel and in `RADIUS` rows around it, in `PARTS` of a gray level."""
@@ -74,7 +65,11 @@ def _is_bridge(disparity, left, right, y, first, end, filled, kinds):
 
 
 @kernel
-def _bridge(disparity, left, right, filled, kinds):
+def bridge_holes(disparity, filled, kinds, left, right):
+    """`filled` and `kinds` with bridges, which have the kind `BRIDGE`; both arrays are changed.
+
+    disparity: (H, W) float32, px, NaN = hole; filled, kinds: as `fill_holes` returns them; left, right: (H, W) uint8.
+    """
     height, width = disparity.shape
     for y in range(height):
         x = 1
@@ -91,6 +86,7 @@ def _bridge(disparity, left, right, filled, kinds):
                 for i in range(first, x):
                     filled[y, i] = _on_line(disparity[y, first - 1], disparity[y, x], i - first + 1, x - first)
                     kinds[y, i] = BRIDGE
+    return filled, kinds
 
 
 def bridge_holes_reference(

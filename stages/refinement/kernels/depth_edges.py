@@ -22,7 +22,10 @@ from stages.refinement.kernels.colours import BYTE, GREEN, levels_apart, packed
 
 F32 = np.float32
 PASSES = 2  # the second one is of the neighbours of pixels that moved
+JUMP = F32(1)  # px between neighbours at an edge of depth
 UNIT = 1000  # weight of a pixel of equal colour
+# Weight by levels of the channel that differs most; it falls to 1/e over 15.
+WEIGHTS = np.round(UNIT * np.exp(-np.arange(256) / 15)).astype(np.int32)
 # Log odds of the nearer surface: a logistic regression over edge pixels of Middlebury scenes and simulated frames. A
 # pixel counts by what its choice changes, and less if only one camera sees it.
 ODDS = F32(-0.3)  # without evidence
@@ -38,15 +41,11 @@ FRACTIONS = 256  # of a pixel
 RED_BLUE = np.uint32(0xFF00FF)  # channels that one multiplication mixes
 
 
-def sharpen_edges(
-    disparity: Array, guessed: Array, left: Array, right: Array, radius: int, jump: float, colour: float,
-    threads: int = 1,
-) -> Array:  # fmt: skip
+def sharpen_edges(disparity: Array, guessed: Array, left: Array, right: Array, radius: int, threads: int = 1) -> Array:
     """Each disparity beside a jump stays, or becomes the mean of its neighbours on the other side of the jump.
 
     disparity: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, guesses, which do not move matches; left, right:
-    (H, W) or (H, W, 3) uint8; radius: of the window, px; jump: px between neighbours; colour: levels of the channel
-    that differs most, over which a weight falls to 1/e. Returns (H, W) float32.
+    (H, W) or (H, W, 3) uint8; radius: of the window, px. Returns (H, W) float32.
     """
     both = shared_by(threads)
     right = _exposed(disparity, guessed, left, right)
@@ -60,9 +59,9 @@ def sharpen_edges(
     taps = _taps(radius) @ [padded.shape[1], 1]
     window = np.stack([WINDOW @ [padded.shape[1], 1], WINDOW @ [width, 1], WINDOW_WEIGHTS])
     weight = F32(ODDS_OF_WINDOW / len(taps) / UNIT)
-    given = layers, guessed, guide, packed(right), window, taps, _weights(colour), weight, radius, F32(jump)
+    given = layers, guessed, guide, packed(right), window, taps, WEIGHTS, weight, radius
     asked, moved, sharp = np.empty(disparity.shape, bool), np.empty(disparity.shape, bool), disparity.copy()
-    by_bands(both, len(disparity), lambda first, end: _find_jumps(padded, radius, F32(jump), asked, first, end))
+    by_bands(both, len(disparity), lambda first, end: _find_jumps(padded, radius, asked, first, end))
     for _ in range(PASSES):
         moved[:] = False
         by_bands(both, len(disparity), lambda first, end: _sharpen(*given, asked, sharp, moved, first, end))
@@ -75,12 +74,6 @@ def _taps(radius: int) -> Array:
     """Offsets of every third pixel of a window from its middle: rows and columns, (n, 2)."""
     taps = np.indices((2 * radius + 1,) * 2).reshape(2, -1).T - radius
     return np.asarray(taps[(taps @ [1, 2]) % 3 == 0])
-
-
-@cache
-def _weights(colour: float) -> Array:
-    """Weight by difference of colour, (256,) int32, `UNIT` for none."""
-    return np.asarray(np.round(UNIT * np.exp(-np.arange(256) / colour)), np.int32)
 
 
 def _exposed(disparity: Array, guessed: Array, left: Array, right: Array) -> Array:
@@ -102,28 +95,28 @@ def _exposed(disparity: Array, guessed: Array, left: Array, right: Array) -> Arr
 
 
 @kernel
-def _find_jumps(disparity, radius, jump, found, first, end):
+def _find_jumps(disparity, radius, found, first, end):
     """Mark the pixels of rows first to end with a jump to one of their eight neighbours; disparity has a border."""
     for y in range(first, end):
         above, row, below = y + radius - 1, y + radius, y + radius + 1
         start = radius - 1
-        _mark_jumps(disparity[above, start:], disparity[row, start:], disparity[below, start:], jump, found[y])
+        _mark_jumps(disparity[above, start:], disparity[row, start:], disparity[below, start:], found[y])
 
 
 @inlined_part
-def _mark_jumps(above, row, below, jump, found):
+def _mark_jumps(above, row, below, found):
     """Mark the pixels of a row; the rows begin one pixel before it. Every test is made, so that the loop vectorises."""
     for x in range(np.uint64(found.size)):  # without sign: numba looks for no negative index
         here, after = x + np.uint64(1), x + np.uint64(2)
         d = row[here]
-        beside = (abs(row[x] - d) > jump) | (abs(row[after] - d) > jump)
-        upper = (abs(above[x] - d) > jump) | (abs(above[here] - d) > jump) | (abs(above[after] - d) > jump)
-        lower = (abs(below[x] - d) > jump) | (abs(below[here] - d) > jump) | (abs(below[after] - d) > jump)
+        beside = (abs(row[x] - d) > JUMP) | (abs(row[after] - d) > JUMP)
+        upper = (abs(above[x] - d) > JUMP) | (abs(above[here] - d) > JUMP) | (abs(above[after] - d) > JUMP)
+        lower = (abs(below[x] - d) > JUMP) | (abs(below[here] - d) > JUMP) | (abs(below[after] - d) > JUMP)
         found[x] = beside | upper | lower
 
 
 @kernel
-def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius, jump, asked, sharp, moved, first, end):
+def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius, asked, sharp, moved, first, end):
     """Sharpen the pixels of rows first to end that are asked; layers and guide have a border.
 
     layers: all disparities, which count for guesses, and those of matches, which count for matches. One array contains
@@ -150,7 +143,7 @@ def _sharpen(layers, guessed, guide, right, window, taps, table, weight, radius,
             x = columns[n]
             layer, at = np.uint64(not guessed[y, x]), np.int64((y + radius) * stride + x + radius)
             low, high = _candidates(disparities, layer, at, stride)
-            if max(high - disparities[layer, at], disparities[layer, at] - low) > jump:
+            if max(high - disparities[layer, at], disparities[layer, at] - low) > JUMP:
                 places[0, count], places[1, count], places[2, count] = y, x, at
                 sides[0, count], sides[1, count] = low, high
                 count += 1
@@ -297,13 +290,11 @@ def _neighbours(disparities, layer, at, stride, middle, above):
     return total / count
 
 
-def sharpen_edges_reference(
-    disparity: Array, guessed: Array, left: Array, right: Array, radius: int, jump: float, colour: float
-) -> Array:
+def sharpen_edges_reference(disparity: Array, guessed: Array, left: Array, right: Array, radius: int) -> Array:
     """`sharpen_edges` in plain numpy, pixel by pixel."""
     right = _exposed(disparity, guessed, left, right)
     left, right = (np.atleast_3d(image).astype(np.int32) for image in (left, right))
-    given = guessed, left, right, _taps(radius), _weights(colour), F32(jump)
+    given = guessed, left, right, _taps(radius)
     once = _sharpened_reference(disparity, np.isfinite(disparity), *given)
     moved = np.pad(np.isfinite(disparity) & (once != disparity), 1)
     near = moved[1:-1, 1:-1] | moved[:-2, 1:-1] | moved[2:, 1:-1] | moved[1:-1, :-2] | moved[1:-1, 2:]
@@ -311,23 +302,22 @@ def sharpen_edges_reference(
 
 
 def _sharpened_reference(
-    disparity: Array, asked: Array, guessed: Array, left: Array, right: Array, taps: Array,
-    table: Array, jump: np.float32,
-) -> Array:  # fmt: skip
+    disparity: Array, asked: Array, guessed: Array, left: Array, right: Array, taps: Array
+) -> Array:
     """One pass over the pixels that are asked."""
     (height, width), sharp = disparity.shape, disparity.copy()
     for y, x in np.argwhere(asked):
         near = np.s_[max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2]
         around = disparity[near][np.isfinite(disparity[near]) & (guessed[near] <= guessed[y, x])]
         low, high = around.min(), around.max()
-        if not max(high - disparity[y, x], disparity[y, x] - low) > jump:
+        if not max(high - disparity[y, x], disparity[y, x] - low) > JUMP:
             continue
         middle = F32(0.5) * (low + high)
         rows, cols = (taps + np.array([y, x])).T
         inside = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
         rows, cols = rows[inside], cols[inside]
         known = np.isfinite(disparity[rows, cols]) & (guessed[rows, cols] <= guessed[y, x])
-        weights = table[np.abs(left[rows, cols] - left[y, x]).max(axis=1)][known]
+        weights = WEIGHTS[np.abs(left[rows, cols] - left[y, x]).max(axis=1)][known]
         vote = (weights * np.where(disparity[rows, cols][known] > middle, 1, -1)).sum()
         odds = ODDS + F32(ODDS_OF_WINDOW / len(taps) / UNIT) * F32(vote)
         odds += ODDS_PER_LEVEL * F32(_worse_reference(left, right, y, x, np.array([low, high])))

@@ -47,10 +47,9 @@ def fill_holes(
     both = shared_by(threads)
     filled, colour = both(disparity.copy, lambda: packed(cv2.blur(image, (3, 3))))
     kinds, first = np.zeros((height, width), np.uint8), np.zeros(height + 1, np.int64)
-    by_bands(both, height, lambda top, end: _count_holes(disparity, top, end, first))
-    np.cumsum(first, out=first)
-    holes, steps = np.empty(first[-1], np.int32), np.empty((8, first[-1]), np.int16)
-    by_bands(both, height, lambda top, end: _list_holes(disparity, top, end, first, holes))
+    holes = np.empty(disparity.size, np.int32)
+    _list_holes(disparity, first, holes)
+    steps = np.empty((8, first[-1]), np.int16)
     both(
         lambda: _count_steps(disparity, first, holes, 1, steps[:4]),
         lambda: _count_steps(disparity, first, holes, -1, steps[4:]),
@@ -61,26 +60,15 @@ def fill_holes(
 
 
 @kernel
-def _count_holes(disparity, begin, end, first):
-    """first[y + 1] becomes the number of holes in row y."""
-    for y in range(begin, end):
-        count = np.int64(0)
-        for x in range(disparity.shape[1]):
-            count += np.int64(disparity[y, x] != disparity[y, x])
-        first[y + 1] = count
-
-
-@kernel
-def _list_holes(disparity, begin, end, first, holes):
-    """holes becomes the columns of the holes; row y starts at first[y]."""
-    for y in range(begin, end):
-        n = first[y]
-        if first[y + 1] == n:
-            continue
+def _list_holes(disparity, first, holes):
+    """holes becomes the columns of the holes; row y has those from first[y] to first[y + 1]."""
+    n = 0
+    for y in range(disparity.shape[0]):
         for x in range(disparity.shape[1]):
             if disparity[y, x] != disparity[y, x]:
                 holes[n] = x
                 n += 1
+        first[y + 1] = n
 
 
 @kernel

@@ -10,6 +10,7 @@ import numpy as np
 from stages.compiled.jit import kernel
 from stages.data import Array, PixelOrigin
 from stages.refinement.kernels.holes import BRIDGE, KEPT, OCCLUSION
+from stages.refinement.kernels.plane_fit import INLIER_DISTANCE
 
 F32 = np.float32
 MATCH_CONFIDENCES = 0.5, 0.75, 1.0
@@ -32,16 +33,17 @@ class Trust(NamedTuple):
 
 def label_origin(
     matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, consistent: Array, reasons: Array,
-    sigma: Array, max_move: float, trust: Trust,
+    sigma: Array, trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
     """Source and confidence of each pixel, (H, W) uint8 codes of `PixelOrigin` and float32.
 
     matches: (H, W) float32, px, NaN = none, before refinement; confidence: (H, W) float32 of the matches; agreed:
     (H, W) bool, pixels that a plane moved or filled; kinds: (H, W) uint8 of `fill_holes` and `bridge_holes`; refined:
     (H, W) float32, the result; consistent: (H, W) bool, pixels where the images agree with it; reasons: (H, W) uint8,
-    codes of pixels that stay unknown; sigma: (H, W) float32, px, of the result, 0 = not stated; max_move: px that a
-    MEASURED pixel may differ from its match, beside two sigmas. A pixel that was filled or differs more is MEASURED
-    where the images agree with it and its sigma is stated; a bridged one never is.
+    codes of pixels that stay unknown; sigma: (H, W) float32, px, of the result, 0 = not stated.
+
+    A MEASURED pixel differs from its match by at most `INLIER_DISTANCE` and two sigmas. A pixel that was filled or
+    differs more is MEASURED where the images agree with it and its sigma is stated; a bridged one never is.
     """
     source, worth = np.empty(matches.shape, np.uint8), np.empty(matches.shape, np.float32)
     steps = np.arange(256) / 255
@@ -50,22 +52,21 @@ def label_origin(
     )
     others = np.array(trust[2:], np.float32)
     _label(
-        matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, F32(max_move), tables, others, source,
-        worth,
+        matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, tables, others, source, worth
     )  # fmt: skip
     return source, worth
 
 
 @kernel
 def _label(
-    matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, max_move, tables, others, source, worth,
+    matches, confidence, agreed, kinds, refined, consistent, reasons, sigma, tables, others, source, worth
 ):  # fmt: skip
     backed, replaced, plane, mismatch, occlusion = others
     for y in range(matches.shape[0]):
         for x in range(matches.shape[1]):
             d, match, kind = refined[y, x], matches[y, x], kinds[y, x]
             blur = np.int64(np.rint(min(sigma[y, x] * F32(SIGMA_STEPS), F32(255))))
-            near = abs(d - match) <= max_move + F32(2) * sigma[y, x]
+            near = abs(d - match) <= F32(INLIER_DISTANCE) + F32(2) * sigma[y, x]
             if d != d:
                 source[y, x], worth[y, x] = reasons[y, x], F32(0)
             elif near and not consistent[y, x]:
@@ -87,13 +88,13 @@ def _label(
 
 def label_origin_reference(
     matches: Array, confidence: Array, agreed: Array, kinds: Array, refined: Array, consistent: Array, reasons: Array,
-    sigma: Array, max_move: float, trust: Trust,
+    sigma: Array, trust: Trust,
 ) -> tuple[Array, Array]:  # fmt: skip
     """`label_origin` in plain numpy."""
     from scipy import special  # takes long to import
 
     own = np.rint(np.clip(confidence, 0, 1) * F32(255)).astype(np.float64) / 255
-    stayed = np.abs(refined - matches) <= F32(max_move) + 2 * sigma
+    stayed = np.abs(refined - matches) <= F32(INLIER_DISTANCE) + 2 * sigma
     blur = np.rint(np.minimum(sigma * F32(SIGMA_STEPS), 255)).astype(np.float64)
     within = special.erf(SIGMA_STEPS / np.maximum(blur, 1) / np.sqrt(2))
     conditions = [

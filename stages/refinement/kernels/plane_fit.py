@@ -227,7 +227,8 @@ def fit_planes_reference(
         root = np.sqrt(weights[y, x][known].astype(np.float64))
         best, plane = np.inf, None
         for h in range(hypotheses):
-            corners = [_random_index_reference(seed, s, 3 * h + i, len(d)) for i in range(3)]
+            with np.errstate(over="ignore"):
+                corners = [_random_index.py_func(U64(seed), s, 3 * h + i, len(d)) for i in range(3)]
             if abs(np.linalg.det(points[corners])) < MIN_TRIANGLE:
                 continue
             candidate = np.linalg.solve(points[corners], d[corners])
@@ -243,11 +244,3 @@ def fit_planes_reference(
         planes.coefficients[s] = plane
         planes.inlier_share[s] = ((points @ plane - d) ** 2 < INLIER_DISTANCE**2).mean()
     return planes
-
-
-def _random_index_reference(seed: int, region: int, counter: int, n: int) -> int:
-    mask = 2**64 - 1
-    z = (seed + region * 0xD1B54A32D192ED03 + counter * 0x9E3779B97F4A7C15) & mask
-    z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
-    z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
-    return ((z ^ (z >> 31)) >> 33) % n

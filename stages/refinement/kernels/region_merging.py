@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.compiled.jit import kernel
 from stages.data import Array
-from stages.refinement.kernels.slic import COMPACTNESS
+from stages.refinement.kernels.slic import COMPACTNESS, add_pixels
 
 ITERATIONS = 3
 
@@ -36,8 +36,10 @@ def merge_regions(image: Array, labels: Array, count: int, groups: int) -> tuple
 
 def _superpixel_points(image: Array, labels: Array, count: int, scale: float) -> tuple[Array, Array]:
     """Mean colour (CIELAB, L in 0..100), y and x times `scale`, (count, 5), and size, (count,), of each superpixel."""
-    sums = np.zeros((count, 6), np.int64)
-    _add_pixels(image, labels, sums)
+    sums = np.zeros((count, 6))
+    add_pixels(image.reshape(*labels.shape, -1), labels, np.float32(1), 0, len(labels), sums)
+    if image.ndim == 2:
+        sums[:, 1:3] = sums[:, :1]
     means = sums[:, :5] / sums[:, 5:]
     rgb = np.clip(np.rint(means[None, :, :3]), 0, 255).astype(np.uint8)
     lab = cv2.cvtColor(rgb, cv2.COLOR_RGB2LAB)[0] * [100 / 255, 1, 1]
@@ -71,20 +73,6 @@ def _nearest_cells(points, size, home, rows, cols):
                     if mass[k] > 0 and distance < best:
                         best, nearest[s] = distance, k
     return nearest
-
-
-@kernel
-def _add_pixels(image, labels, sums):
-    """Add R, G, B, y, x and 1 of each pixel to the sums of its label."""
-    gray = image.ndim == 2
-    for y in range(labels.shape[0]):
-        for x in range(labels.shape[1]):
-            total = sums[labels[y, x]]
-            for channel in range(3):
-                total[channel] += np.int64(image[y, x] if gray else image[y, x, channel])
-            total[3] += y
-            total[4] += x
-            total[5] += 1
 
 
 def merge_regions_reference(image: Array, labels: Array, count: int, groups: int) -> tuple[Array, int]:

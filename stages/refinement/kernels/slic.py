@@ -86,8 +86,8 @@ def _move_centres(colour: Array, centres: Array, grid: tuple[int, int], weight: 
     upper, lower = np.zeros((2, len(centres), 6))
     middle = len(colour) // 2
     both(
-        lambda: _add_pixels(colour, labels, 0, middle, upper),
-        lambda: _add_pixels(colour, labels, middle, len(colour), lower),
+        lambda: add_pixels(colour, labels, LIGHTNESS_SCALE, 0, middle, upper),
+        lambda: add_pixels(colour, labels, LIGHTNESS_SCALE, middle, len(colour), lower),
     )
     sums = upper + lower
     seen = sums[:, 5] > 0
@@ -158,13 +158,16 @@ def _find_nearest(work, y, position_weight):
 
 
 @kernel
-def _add_pixels(colour, labels, first, end, sums):
-    """Add colour, y, x and 1 of the pixels of rows first to end to the `sums` of their labels, (n, 6) float64."""
+def add_pixels(colour, labels, scale, first, end, sums):
+    """Add colour, y, x and 1 of the pixels of rows first to end to the `sums` of their labels, (n, 6) float64.
+
+    scale: of the first channel; of a gray image the second and third are not added.
+    """
     channels = colour.shape[2]
     for y in range(first, end):
         for x in range(colour.shape[1]):
             total = sums[labels[y, x]]
-            total[0] += F32(colour[y, x, 0]) * LIGHTNESS_SCALE
+            total[0] += F32(colour[y, x, 0]) * scale
             if channels == 3:
                 total[1] += colour[y, x, 1]
                 total[2] += colour[y, x, 2]
@@ -314,14 +317,11 @@ def assign_reference(colour: Array, centres: Array, rows: int, cols: int, positi
 
 
 def connect_reference(labels: Array, min_size: int) -> tuple[Array, int]:
-    """`connect` by scipy, label after label: the numbers, (H, W) int32, and their count."""
-    from scipy import ndimage
+    """`connect` by scikit-image's components: the numbers, (H, W) int32, and their count."""
+    from skimage import measure  # takes long to import
 
     height, width = labels.shape
-    component = np.zeros((height, width), np.int64)
-    for label in np.unique(labels):
-        found, _ = ndimage.label(labels == label)
-        component = np.where(found > 0, found + np.max(component), component)
+    component = measure.label(labels, background=-1, connectivity=1)  # type: ignore[no-untyped-call]
     numbers, total = np.full((height, width), -1, np.int32), 0
     for y, x in np.ndindex(height, width):
         if numbers[y, x] >= 0:

@@ -36,26 +36,14 @@ def extent(disparity: Array) -> Extent:
     window, border = (SPECK_WINDOW, SPECK_WINDOW), cv2.BORDER_REPLICATE
     around = cv2.boxFilter(known.view(np.uint8), cv2.CV_16U, window, normalize=False, borderType=border)
     known &= around > least
-    _find_ends(known, found.first, found.last)
-    _find_top(known, found.top)
+    _find_ends(known, *found)
     return found
 
 
 @kernel
-def _find_top(known, top):
-    missing = top.size
-    for y in range(known.shape[0]):
-        if missing == 0:
-            break
-        for x in range(top.size):
-            if known[y, x] and y < top[x]:
-                top[x] = y
-                missing -= 1
-
-
-@kernel
-def _find_ends(known, first, last):
+def _find_ends(known, top, first, last):
     width = known.shape[1]
+    missing = width  # columns without a known pixel so far
     for y in range(known.shape[0]):
         row = known[y]
         x = 0
@@ -68,6 +56,11 @@ def _find_ends(known, first, last):
         while not row[x]:
             x -= 1
         last[y] = x
+        if missing > 0:
+            for x in range(first[y], last[y] + 1):
+                if row[x] and y < top[x]:
+                    top[x] = y
+                    missing -= 1
 
 
 def extent_reference(disparity: Array) -> Extent:

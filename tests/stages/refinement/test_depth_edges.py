@@ -6,13 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.refinement.kernels.depth_edges import sharpen_edges, sharpen_edges_reference
-from stages.refinement.refine import DEPTH_EDGE, EDGE_COLOUR
 
-RULE = 3, DEPTH_EDGE, EDGE_COLOUR
+RADIUS = 3
 
 
 def sharpened(disparity, left, right=None):
-    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), left, left if right is None else right, *RULE)
+    return sharpen_edges(disparity, np.zeros(disparity.shape, bool), left, left if right is None else right, RADIUS)
 
 
 @given(st.integers(1, 14), st.integers(1, 14), st.integers(1, 5), st.integers(0, 2**31), st.sampled_from([(), (3,)]))
@@ -21,7 +20,7 @@ def test_the_choice_equals_its_reference(height, width, radius, seed, channels):
     disparity = np.float32(random.choice([-900.0, 3.0, 5.0], (height, width)) + random.normal(0, 0.2, (height, width)))
     disparity[random.random(disparity.shape) < 0.2] = np.nan
     left, right = random.integers(0, 60, (2, height, width, *channels), np.uint8)
-    everything = disparity, random.random(disparity.shape) < 0.3, left, right, radius, *RULE[1:]
+    everything = disparity, random.random(disparity.shape) < 0.3, left, right, radius
     sharp = sharpen_edges(*everything)
     np.testing.assert_array_equal(sharp, sharpen_edges_reference(*everything))
     np.testing.assert_array_equal(sharp, sharpen_edges(*everything, threads=2))
@@ -72,13 +71,13 @@ def test_guesses_do_not_move_matches_but_follow_them():
     disparity, image = np.full((20, 20), 10, np.float32), np.full((20, 20), 90, np.uint8)
     disparity[9:11, 9:11] = 30
     guessed = disparity == 10
-    assert np.array_equal(sharpen_edges(disparity, guessed, image, image, *RULE), disparity)
-    assert (sharpen_edges(disparity, ~guessed, image, image, *RULE) == 10).all()
+    assert np.array_equal(sharpen_edges(disparity, guessed, image, image, RADIUS), disparity)
+    assert (sharpen_edges(disparity, ~guessed, image, image, RADIUS) == 10).all()
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (9, 1)])
 def test_images_of_a_row_or_a_column_work(shape):
     disparity = np.arange(np.prod(shape), dtype=np.float32).reshape(shape) * 4
     image = np.zeros(shape, np.uint8)
-    everything = disparity, np.zeros(shape, bool), image, image, *RULE
+    everything = disparity, np.zeros(shape, bool), image, image, RADIUS
     assert np.array_equal(sharpen_edges(*everything), sharpen_edges_reference(*everything))

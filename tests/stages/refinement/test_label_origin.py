@@ -23,7 +23,7 @@ def test_origin_and_confidence_equal_the_reference(height, width, seed):
     reasons = rng.choice(np.array([0, 4, 6, 10], np.uint8), shape)
     sigma = rng.choice([0, 0.1, 0.3, 2, 1e6], shape).astype(np.float32)
     agreed, correlated = (rng.random(shape) < share for share in (0.5, 0.8))
-    given = matches, confidence, agreed, kinds, refined, correlated, reasons, sigma, 0.5, TRUST
+    given = matches, confidence, agreed, kinds, refined, correlated, reasons, sigma, TRUST
     source, worth = label_origin(*given)
     expected, expected_worth = label_origin_reference(*given)
     assert np.array_equal(source, expected)
@@ -40,7 +40,7 @@ def test_every_origin_has_its_own_confidence():
     reasons = np.full((1, 8), PixelOrigin.LEFT_RIGHT, np.uint8)
     own = np.full((1, 8), 0.75, np.float32)
     source, worth = label_origin(
-        matches, own, agreed, kinds, refined, correlated, reasons, np.zeros((1, 8), np.float32), 0.5, TRUST
+        matches, own, agreed, kinds, refined, correlated, reasons, np.zeros((1, 8), np.float32), TRUST
     )
     names = [PixelOrigin(code).name for code in source[0]]
     assert names == ["MEASURED", "MEASURED", "FILLED", "PLANE", "PLANE", "FILLED", "FILLED", "LEFT_RIGHT"]
@@ -52,7 +52,7 @@ def test_a_hole_that_the_images_support_is_measured_unless_it_is_hidden_or_bridg
     kinds = np.array([[KEPT, MISMATCH, OCCLUSION, BRIDGE]], np.uint8)
     supported, nothing = np.ones((1, 4), bool), np.zeros((1, 4), np.uint8)
     sigma = np.full((1, 4), 0.2, np.float32)
-    source, _ = label_origin(hole, own, supported, kinds, own, supported, nothing, sigma, 0.5, TRUST)
+    source, _ = label_origin(hole, own, supported, kinds, own, supported, nothing, sigma, TRUST)
     assert [PixelOrigin(code).name for code in source[0]] == ["MEASURED", "MEASURED", "FILLED", "FILLED"]
 
 
@@ -60,5 +60,5 @@ def test_confidence_falls_with_sigma():
     one, nothing = np.ones((1, 3), np.float32), np.zeros((1, 3), np.uint8)
     yes = np.ones((1, 3), bool)
     sigma = np.array([[0.1, 0.5, 1.0]], np.float32)
-    _, worth = label_origin(one, one, yes, nothing, one, yes, nothing, sigma, 0.5, TRUST)
+    _, worth = label_origin(one, one, yes, nothing, one, yes, nothing, sigma, TRUST)
     assert np.allclose(worth[0] / worth[0, 0], [1, 0.954, 0.683], atol=2e-3)

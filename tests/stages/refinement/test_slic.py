@@ -46,13 +46,6 @@ def test_components_are_numbered_as_a_flood_fill_does(height, width, kinds, smal
     assert np.array_equal(labels, expected)
 
 
-def test_an_edge_of_the_image_is_an_edge_of_segments():
-    image = np.full((120, 160), 60, np.uint8)
-    image[:, 83:] = 180
-    labels, _ = slic.superpixels(image, 48)
-    assert not set(labels[:, :83].ravel()) & set(labels[:, 83:].ravel())
-
-
 @pytest.mark.parametrize("channels", [3, 1])
 def test_assignment_is_the_nearest_of_nine_centres(photo, channels):
     image = photo[:90, :131] if channels == 3 else photo[:90, :131, 1]
