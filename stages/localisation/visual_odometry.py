@@ -13,10 +13,9 @@ import numpy as np
 from flow.contracts import Finding, counted
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
 from stages.data.covariance import cross_matrix, translated_covariance
-from stages.localisation.vo_tracking import Step, VoFrame, step_between, vo_frame
+from stages.localisation.vo_tracking import MIN_FEATURES, Step, VoFrame, step_between, vo_frame
 from stages.stage import Stage, check_joined
 
-MIN_FEATURES = 40  # that agree on a motion
 MAX_RMS = 2.0  # px, reprojection error of a motion
 MAX_MOTION = 5.0  # m, between two frames
 MAX_KEYFRAME_FLOW = 0.03  # of the image's width, since the keyframe
@@ -65,7 +64,7 @@ class VisualOdometry(Stage):
         """The camera's motion since its segment began; `camera` is None if the frame has too few features."""
         check_joined(self, frame, disparity)
         before, now = state.keyframe, vo_frame(frame, disparity)
-        step = step_between(before.frame, now, MIN_FEATURES) if before is not None else None
+        step = step_between(before.frame, now) if before is not None else None
         if before is not None and step is not None and _plausible(step):
             return _tracked(frame.stamp, before, step, now, state)
         # The first frame needs only one feature: it may be the only frame.

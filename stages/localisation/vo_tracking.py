@@ -17,6 +17,7 @@ from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.robust_weights import tukey_weights
 
+MIN_FEATURES = 40  # that agree on a motion
 DETECTION_WIDTH = 640  # px, approximate largest width of the image in which features are detected
 MAX_FEATURES = 1500
 MAX_HAMMING_BITS = 64  # between the descriptors of a pair, of 256
@@ -94,39 +95,35 @@ def _triangulated(pixels: Array, disparity: Disparity, camera: StereoCamera) -> 
     return np.stack([x * depth, y * depth, depth], axis=1)
 
 
-def step_between(earlier: VoFrame, later: VoFrame, min_features: int) -> Step | None:
+def step_between(earlier: VoFrame, later: VoFrame) -> Step | None:
     """The camera's motion between two frames; None if too few features agree or the image sizes differ."""
     if earlier.gray.shape != later.gray.shape:
         return None
     matrix = np.array([[later.camera.fx, 0, later.camera.cx], [0, later.camera.fy, later.camera.cy], [0, 0, 1.0]])
     here, there = _pairs(earlier, later)
-    if len(here) < min_features:
+    if len(here) < MIN_FEATURES:
         return None
     tolerance = RANSAC_TOLERANCE * max(1.0, later.gray.shape[1] / DETECTION_WIDTH)
     found, turn, shift, agreeing = cv2.solvePnPRansac(
         earlier.points[here], later.pixels[there].astype(np.float64), matrix, None, iterationsCount=RANSAC_TRIALS,
         reprojectionError=tolerance, confidence=0.9999, flags=cv2.SOLVEPNP_P3P,
     )  # fmt: skip
-    if not found or agreeing is None or len(agreeing) < min_features:
+    if not found or agreeing is None or len(agreeing) < MIN_FEATURES:
         return None
-    return _tracked_step(earlier, later, matrix, turn, shift, min_features)
+    return _tracked_step(earlier, later, matrix, turn, shift)
 
 
 def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
     """Indices of matching features; each earlier feature has a point."""
     known = np.flatnonzero(np.isfinite(earlier.points[:, 2]))
-    here, there = clear_partners(
-        earlier.descriptors[known], later.descriptors, MAX_HAMMING_BITS, MAX_DISTANCE_RATIO
-    )  # fmt: skip
+    here, there = clear_partners(earlier.descriptors[known], later.descriptors, MAX_HAMMING_BITS, MAX_DISTANCE_RATIO)
     return known[here], there
 
 
-def _tracked_step(
-    earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array, min_features: int
-) -> Step | None:
+def _tracked_step(earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array) -> Step | None:
     """The pose fitted to patches of the earlier image, tracked from their positions predicted by the given pose."""
     points, start, guess = _predicted(earlier, later, matrix, turn, shift)
-    if len(points) < min_features:
+    if len(points) < MIN_FEATURES:
         return None
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
@@ -134,9 +131,9 @@ def _tracked_step(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     good = (status[:, 0] == 1) & (np.linalg.norm(found - guess, axis=1) < MAX_PATCH_SHIFT)
-    if np.count_nonzero(good) < min_features:
+    if np.count_nonzero(good) < MIN_FEATURES:
         return None
-    return _fitted(points[good], start[good], found[good].astype(np.float64), matrix, turn, shift, min_features)
+    return _fitted(points[good], start[good], found[good].astype(np.float64), matrix, turn, shift)
 
 
 def _predicted(
@@ -155,9 +152,7 @@ def _predicted(
     return points[inside], pixels[inside], at[inside].astype(np.float32)
 
 
-def _fitted(
-    points: Array, start: Array, found: Array, matrix: Array, turn: Array, shift: Array, min_features: int
-) -> Step | None:
+def _fitted(points: Array, start: Array, found: Array, matrix: Array, turn: Array, shift: Array) -> Step | None:
     """The pose that fits points (N, 3) to their pixels (N, 2), by Gauss-Newton with Tukey's weights."""
     pose = np.concatenate([turn.ravel(), shift.ravel()])
     for _ in range(FIT_ROUNDS):
@@ -173,7 +168,7 @@ def _fitted(
             return None
         pose = pose + np.linalg.solve(normal, jacobian.T @ (errors * both))
     inside = weights > 0
-    if np.count_nonzero(inside) < min_features:
+    if np.count_nonzero(inside) < MIN_FEATURES:
         return None
     # The Jacobian is with respect to the rotation vector, close enough to a small rotation for a few degrees.
     covariance = np.linalg.inv(normal) * (ERROR_INFLATION * scale) ** 2

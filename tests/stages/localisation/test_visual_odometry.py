@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from recordings.simulator import Simulation
 from recordings.simulator.ground_truth import true_disparity
 from stages import Halve, PixelOrigin, StereoCamera, StereoFrame, Transform, VisualOdometry
-from stages.localisation.visual_odometry import MIN_FEATURES, OdometryMemory, _Keyframe, _plausible, _tracked
-from stages.localisation.vo_tracking import MAX_DEPTH, Step, VoFrame, _fitted, vo_frame
+from stages.localisation.visual_odometry import OdometryMemory, _Keyframe, _plausible, _tracked
+from stages.localisation.vo_tracking import MAX_DEPTH, MIN_FEATURES, Step, VoFrame, _fitted, vo_frame
 from tests.stages.builders import disparity_of
 from tests.stages.running import Running
 
@@ -192,5 +192,5 @@ def test_points_on_a_line_determine_no_motion(same, found):
     points[:, same] = 4.0  # m
     matrix = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
     pixels = (points @ matrix.T)[:, :2] / points[:, 2:]
-    step = _fitted(points, pixels, pixels, matrix, np.zeros(3), np.zeros(3), MIN_FEATURES)
+    step = _fitted(points, pixels, pixels, matrix, np.zeros(3), np.zeros(3))
     assert (step is not None) == found
