@@ -141,9 +141,12 @@ def start_up(cache: Path) -> None:
     print(f"{'Match 192 x2':34} {cold:8.2f} {warm:7.2f} {following:7.2f} {megabytes:6.0f}")
 
 
-def accuracy(folder: Path) -> None:
-    """Print the errors of Match and of OpenCV's best mode on scenes with truth, before refinement."""
-    rows: dict[str, list[list[float]]] = {}
+def scene_errors(folder: Path) -> dict[str, Array]:
+    """Means over scenes with truth, %, of Match and of OpenCV's best mode, before refinement, not occluded.
+
+    Of the pixels kept, those off by over 1 px; the pixels kept; pixels off by over 0.5 and 1 px, with rows filled.
+    """
+    found: dict[str, list[list[float]]] = {}
     for scene in sorted(folder.iterdir()):
         frame, truth, mask, levels = load_scene(scene)
         matcher = cv2.StereoSGBM.create(0, levels, 5, 300, 2850, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
@@ -156,9 +159,14 @@ def accuracy(folder: Path) -> None:
             kept = np.abs(pixels - truth)[scored & np.isfinite(pixels)]
             filled = np.abs(rows_filled(pixels) - truth)[scored]
             bad = [np.mean(~(filled <= limit)) for limit in (0.5, 1)]
-            rows.setdefault(name, []).append([np.mean(kept > 1), len(kept) / scored.sum(), *bad])
+            found.setdefault(name, []).append([np.mean(kept > 1), len(kept) / scored.sum(), *bad])
+    return {name: 100 * np.mean(values, axis=0) for name, values in found.items()}
+
+
+def accuracy(folder: Path) -> None:
+    """Print these errors, and their ratios."""
     print(f"\n{'mean of the scenes, not occluded, %':34} kept bad-1  density  filled bad-0.5  filled bad-1")
-    means = {name: 100 * np.mean(values, axis=0) for name, values in rows.items()}
+    means = scene_errors(folder)
     for name, (kept, density, half, one) in means.items():
         print(f"{name:34} {kept:10.2f} {density:8.1f} {half:15.2f} {one:13.2f}")
         ratio = means[name] / means["OpenCV HH"]

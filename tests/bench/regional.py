@@ -39,19 +39,18 @@ MIN_CELLS = 300  # of a part
 CELL, REACH, FINE = 0.05, 8.0, 3  # FINE: points along a cell's side that its true mean is of
 COLUMNS = (
     ("seed", 5), ("rocks k", 8), ("seam cm: placed", 16), ("worst", 6), ("fused", 6), ("worst", 6), ("RMSE cm", 8),
-    ("within 1, 2 sigma %", 20), ("contradicted %", 15), ("ms a frame: map", 16), ("navigation", 11),
+    ("within 1, 2 sigma %", 20), ("ms a frame: map", 16), ("navigation", 11),
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class RegionFigures:
     """Figures of the regional map of a traverse. seams: (frames - 1, 2) m, placed and fused; errors: (n,) m, of cells
-    that frames changed; sigmas: (n,) m, stated for them; contradicted: share of cells; seconds: by stream."""
+    that frames changed; sigmas: (n,) m, stated for them; seconds: by stream."""
 
     seams: Array
     errors: Array
     sigmas: Array
-    contradicted: float
     seconds: dict[str, float]
 
     def row(self) -> list[str]:
@@ -59,7 +58,7 @@ class RegionFigures:
         seams = [figure for which in self.seams.T for figure in (np.median(which), which.max())]
         return [
             *(f"{100 * value:.2f}" for value in seams),
-            f"{100 * np.sqrt(np.mean(self.errors**2)):.2f}", within([self]), f"{100 * self.contradicted:.1f}",
+            f"{100 * np.sqrt(np.mean(self.errors**2)):.2f}", within([self]),
             *(f"{1e3 * self.seconds[name] / FRAMES:.0f}" for name in ("regional_map", "regional_navigation_map")),
         ]  # fmt: skip
 
@@ -198,9 +197,8 @@ def _nmad(one: tuple[Array, Array], other: tuple[Array, Array]) -> float:
     return float(1.4826 * np.median(np.abs(off - np.median(off))))
 
 
-def _errors(simulation: Simulation, maps: list[ElevationMap]) -> tuple[Array, Array, float]:
-    """Errors of the cells that each frame changed, less a plane, their standard deviations, and the share of cells that
-    were contradicted in the end."""
+def _errors(simulation: Simulation, maps: list[ElevationMap]) -> tuple[Array, Array]:
+    """Errors of the cells that each frame changed, less a plane, and their standard deviations."""
     errors, sigmas = [], []
     for terrain in maps:
         layers, now = terrain.layers, simulation.base_at(terrain.stamp)
@@ -214,9 +212,7 @@ def _errors(simulation: Simulation, maps: list[ElevationMap]) -> tuple[Array, Ar
         error[fresh] -= given.translation[2] - true.translation[2]
         errors.append(without_plane(x, y, error)[fresh])
         sigmas.append(np.sqrt(layers["variance"][fresh]))
-    known = maps[-1].layers["frames"] > 0
-    contradicted = float(np.mean(maps[-1].layers["contradictions"][known] > 0))
-    return np.concatenate(errors), np.concatenate(sigmas), contradicted
+    return np.concatenate(errors), np.concatenate(sigmas)
 
 
 def _surface(simulation: Simulation, world: Transform, x: Array, y: Array, cells: Array) -> Array:

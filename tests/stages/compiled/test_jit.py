@@ -77,14 +77,6 @@ def test_kernels_are_cached_loaded_early_and_recompiled_after_a_change(run, tmp_
 
 
 @pytest.mark.slow
-def test_kernels_are_recompiled_after_a_change_of_the_codes_in_them(run, tmp_path):
-    run()
-    codes = tmp_path / "stages" / "data" / "pixel_validity.py"  # the values of its enumerations are compiled in
-    codes.write_text(f"{codes.read_text()}\n# changed\n")
-    assert "compiling kernels" in run()[1]
-
-
-@pytest.mark.slow
 def test_compiled_and_loaded_kernels_give_the_same_bits(run):
     first, stderr = run(PLANES)
     assert "compiling kernels" in stderr
@@ -92,14 +84,20 @@ def test_compiled_and_loaded_kernels_give_the_same_bits(run):
 
 
 @pytest.mark.slow
-def test_a_change_in_the_simulator_keeps_the_kernels_of_the_stages(run, tmp_path):
-    matching, terrain, simulator = run(DIGESTS)[0].split()
-    assert matching == terrain != simulator
-    loops = tmp_path / "recordings" / "simulator" / "raycast.py"
-    loops.write_text(f"{loops.read_text()}\n# changed\n")
-    again = run(DIGESTS)[0].split()
-    assert again[:2] == [matching, terrain]
-    assert again[2] != simulator
+@pytest.mark.parametrize(
+    ("file", "of_stages"),
+    [
+        ("recordings/simulator/raycast.py", False),
+        ("stages/data/pixel_validity.py", True),
+    ],  # its codes are compiled
+)
+def test_a_change_marks_the_kernels_of_its_own_family(run, tmp_path, file, of_stages):
+    before = run(DIGESTS)[0].split()
+    assert before[0] == before[1] != before[2]
+    changed = tmp_path / file
+    changed.write_text(f"{changed.read_text()}\n# changed\n")
+    after = run(DIGESTS)[0].split()
+    assert [one != other for one, other in zip(before, after, strict=True)] == [of_stages, of_stages, not of_stages]
 
 
 def decorators(function):
