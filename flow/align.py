@@ -153,28 +153,21 @@ class _Sampler(Checked):
     ports = ("stream", "at")
     clock = "at"
     patience = 0  # ns of log time
+    smooth = 0  # ns; how far from a stamp samples are used
 
     def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples."""
         return kinds["stream"]
 
-    @property
-    def reach(self) -> int:
-        """How far before a stamp samples are used, ns."""
-        return 0
-
     def start(self, name: str, inputs: dict[str, str]) -> SamplerState:
         """A running aligner; `inputs` maps ports to stream names."""
         return SamplerState(self, name, inputs)
 
-    def choose(
-        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
-    ) -> Any:
+    def choose(self, state: SamplerState, stamp: int, final: str) -> Any:
         """The value at `stamp`; or a sentence (str) why there is none; or None to wait for more samples.
 
-        node: the aligner's stream, whose settings a sentence names; name: the sampled stream. final: empty while more
-        samples may come, else how long the aligner waited, in words; it must not wait then. intervals: ns, the last
-        ones between samples. May raise what the methods of the samples raise.
+        final: empty while more samples may come, else how long the aligner waited, in words; it must not wait then.
+        May raise what the methods of the samples raise.
         """
         raise NotImplementedError
 
@@ -193,11 +186,6 @@ class Interpolate(_Sampler):
     patience: int = _duration(1_000_000_000, "log time to wait for the later neighbour")
     smooth: int = _duration(0, "samples this close to the stamp are smoothed; 0: interpolate between two neighbours")
 
-    @property
-    def reach(self) -> int:
-        """How far before a stamp samples are used, ns."""
-        return self.smooth
-
     def output(self, kinds: dict[str, type]) -> type:
         """The type of the samples; raises TypeError where it lacks the method to interpolate or to smooth them."""
         for method in ("interpolated", "smoothed") if self.smooth else ("interpolated",):
@@ -205,24 +193,22 @@ class Interpolate(_Sampler):
                 raise TypeError(f"a {kinds['stream'].__name__} cannot be {method}")
         return kinds["stream"]
 
-    def choose(
-        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
-    ) -> Any:
-        before, after = _neighbours(samples, stamp)
+    def choose(self, state: SamplerState, stamp: int, final: str) -> Any:
+        before, after = state.neighbours(stamp)
         exact = before is not None and before.stamp == stamp
-        awaited = after is None or samples[-1].stamp < stamp + self.smooth
+        awaited = after is None or state.samples[-1].stamp < stamp + self.smooth
         if awaited and not final and (self.smooth or not exact):
             return None
-        max_gap = self.max_gap_of(intervals)
+        max_gap = self.max_gap_of(state.intervals)
         wide = before is not None and after is not None and after.stamp - before.stamp > max_gap
         if before is not None and exact and (after is None or wide or not self.smooth):
             return before.value
         if before is None or after is None:
-            return _none(name, stamp, samples, final)
+            return state.none(stamp, final)
         if wide:
-            limit = f"{_time(max_gap)} ({node}.max_gap)"
-            return f"{name} has a gap of {_time(after.stamp - before.stamp)}, more than {limit}"
-        near = self._near(samples, stamp)
+            limit = f"{_time(max_gap)} ({state.name}.max_gap)"
+            return f"{state.stream} has a gap of {_time(after.stamp - before.stamp)}, more than {limit}"
+        near = self._near(state.samples, stamp)
         if len(near) >= MIN_SMOOTHING_SAMPLES:
             return before.value.smoothed(near, stamp)
         return before.value.interpolated(after.value, stamp)
@@ -250,20 +236,18 @@ class Nearest(_Sampler):
     slop: int = _duration(50_000_000, "largest time between sample and stamp")
     patience: int = _duration(1_000_000_000, "log time to wait for a nearer sample")
 
-    def choose(
-        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
-    ) -> Any:
-        before, after = _neighbours(samples, stamp)
+    def choose(self, state: SamplerState, stamp: int, final: str) -> Any:
+        before, after = state.neighbours(stamp)
         if after is None and not final and not (before is not None and before.stamp == stamp):
             return None
         neighbours = [sample for sample in (before, after) if sample is not None]
         if not neighbours:
-            return _none(name, stamp, samples, final)
+            return state.none(stamp, final)
         found = min(neighbours, key=lambda sample: abs(sample.stamp - stamp))
         apart = abs(found.stamp - stamp)
         if apart > self.slop:
-            nearest = f"the nearest {name} sample{'' if after else final} is {_time(apart)} away"
-            return f"{nearest}, more than {_time(self.slop)} ({node}.slop)"
+            nearest = f"the nearest {state.stream} sample{'' if after else final} is {_time(apart)} away"
+            return f"{nearest}, more than {_time(self.slop)} ({state.name}.slop)"
         return found.value
 
 
@@ -271,15 +255,16 @@ class Nearest(_Sampler):
 class Latest(_Sampler):
     """The last sample of `stream` at or before each stamp of `at`, of those logged by then, whatever its age."""
 
-    def choose(
-        self, node: str, name: str, stamp: int, samples: deque[Token], final: str, intervals: Sequence[int] = ()
-    ) -> Any:
-        before, _ = _neighbours(samples, stamp)
-        return _none(name, stamp, samples, " logged by then") if before is None else before.value
+    def choose(self, state: SamplerState, stamp: int, final: str) -> Any:
+        before, _ = state.neighbours(stamp)
+        return state.none(stamp, " logged by then") if before is None else before.value
 
 
 class SamplerState:
-    """The stamps that wait for a sample, and the samples that they may need."""
+    """The stamps that wait for a sample, and the samples that they may need.
+
+    name: the aligner's stream; stream: the sampled one; intervals: ns, the last ones between samples.
+    """
 
     def __init__(self, config: _Sampler, name: str, inputs: dict[str, str]) -> None:
         self.config, self.name, self.stream = config, name, inputs["stream"]
@@ -321,9 +306,7 @@ class SamplerState:
             elif arrived + self.config.patience < log_time:
                 final = f" within {_time(self.config.patience)} of log time ({self.name}.patience)"
             try:
-                value = self.config.choose(
-                    self.name, self.stream, token.stamp, self.samples, final, self.intervals
-                )  # fmt: skip
+                value = self.config.choose(self, token.stamp, final)
             except Exception as error:
                 value = Absent(Loss(self.name, token.stamp, self.name, LossReason.FAILED, failure(error)))
             if value is None:
@@ -337,30 +320,28 @@ class SamplerState:
     def _forget(self, log_time: int) -> None:
         """Drop samples that no later stamp can need, and those older than `SAMPLE_HISTORY`."""
         while len(self.samples) > 1 and (
-            (self.answered is not None and self.samples[1].stamp <= self.answered - self.config.reach)
+            (self.answered is not None and self.samples[1].stamp <= self.answered - self.config.smooth)
             or (not self.wanted and self.arrivals[1] + SAMPLE_HISTORY < log_time)
         ):
             self.samples.popleft()
             self.arrivals.popleft()
 
+    def neighbours(self, stamp: int) -> tuple[Token | None, Token | None]:
+        """The last sample at or before `stamp` and the first one after it."""
+        before = None
+        for sample in self.samples:
+            if sample.stamp > stamp:
+                return before, sample
+            before = sample
+        return before, None
 
-def _neighbours(samples: deque[Token], stamp: int) -> tuple[Token | None, Token | None]:
-    """The last sample at or before `stamp` and the first one after it."""
-    before = None
-    for sample in samples:
-        if sample.stamp > stamp:
-            return before, sample
-        before = sample
-    return before, None
-
-
-def _none(name: str, stamp: int, samples: deque[Token], final: str) -> str:
-    """The sentence about missing samples: which ones are missing, and how far away the nearest is."""
-    if not samples:
-        return f"no {name} sample{final}"
-    if samples[0].stamp > stamp:
-        return f"the first {name} sample is {_time(samples[0].stamp - stamp)} later"
-    return f"no later {name} sample{final}; the last is {_time(stamp - samples[-1].stamp)} earlier"
+    def none(self, stamp: int, final: str) -> str:
+        """The sentence about missing samples: which ones are missing, and how far away the nearest is."""
+        if not self.samples:
+            return f"no {self.stream} sample{final}"
+        if self.samples[0].stamp > stamp:
+            return f"the first {self.stream} sample is {_time(self.samples[0].stamp - stamp)} later"
+        return f"no later {self.stream} sample{final}; the last is {_time(stamp - self.samples[-1].stamp)} earlier"
 
 
 def _paired(name: str, left: Token, right: Token) -> Any:

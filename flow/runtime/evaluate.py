@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from flow.contracts import nearest
@@ -45,7 +45,11 @@ def evaluate(
     6.0
     """
     plan, lacking = dict[str, tuple[Node, dict[str, str]]](), dict[str, str]()  # lacking: stream -> the one to give
-    for node in needed(graph, given, wanted):
+    known = [*graph.source_streams, *(node.name for node in graph.nodes)]
+    for name in (wanted, *given):
+        if name not in known:
+            raise UsageError(f"the pipeline has no stream '{name}'{nearest(name, known)}")
+    for node in graph.upstream_of([wanted], given).nodes:
         inputs = {port: stream for port, stream in node.inputs.items() if stream in given or stream in plan}
         absent = node.inputs.keys() - inputs.keys()
         if node.aligns:
@@ -67,20 +71,3 @@ def evaluate(
             item = node.actor(**{port: streams[stream] for port, stream in inputs.items()}, **state)
             streams |= {} if item is None else {name: item}
     return streams
-
-
-def needed(graph: Graph, given: Collection[str], wanted: str) -> tuple[Node, ...]:
-    """The nodes that make a stream where others are given, each after those that it needs, but for those of aligners.
-
-    Raises UsageError if the pipeline lacks one of these streams.
-    """
-    known = [*graph.source_streams, *(node.name for node in graph.nodes)]
-    for name in (wanted, *given):
-        if name not in known:
-            raise UsageError(f"the pipeline has no stream '{name}'{nearest(name, known)}")
-    names, found = {wanted} - {*given}, list[Node]()
-    for node in reversed(graph.nodes):  # every node comes after its inputs
-        if node.name in names:
-            found.append(node)
-            names |= set() if node.aligns else {*node.inputs.values()} - {*given}
-    return tuple(reversed(found))

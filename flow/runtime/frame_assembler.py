@@ -15,7 +15,7 @@ from typing import Any
 
 from flow.align import Answers, Token
 from flow.contracts import Absent, Event, Loss, LossReason
-from flow.runtime.frame_selection import FrameSelection
+from flow.runtime.frame_selection import Every, FrameSelection
 from flow.runtime.graph import Graph
 from flow.runtime.ledger import Ledger
 
@@ -118,17 +118,16 @@ def _checked(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:
 
 
 class FrameAssembler:
-    """Makes frames of one log with the aligners of a graph. selection: the frames to take; None: all of them."""
+    """Makes frames of one log with the aligners of a graph. selection: the frames to take, by default all."""
 
     def __init__(self, graph: Graph, ledger: Ledger, selection: FrameSelection | None = None) -> None:
-        self._ledger, self._selection, self._clock = ledger, selection, graph.clock
+        self._ledger, self._selection, self._clock = ledger, selection or FrameSelection(Every()), graph.clock
         self._aligners = {n.name: n.actor.start(n.name, dict(n.inputs)) for n in graph.aligners}
         self._ports: dict[str, list[tuple[str, str]]] = {}
         for node in graph.aligners:
             for port, stream in node.inputs.items():
                 self._ports.setdefault(stream, []).append((node.name, port))
-        self._odometry = selection.odometry if selection else None
-        self._wanted = graph.source_streams | ({self._odometry} if self._odometry else set())
+        self.wanted = graph.source_streams | {*filter(None, [self._selection.odometry])}
         made = {node.name for node in graph.stages}
         self._entry_streams = [stream for stream in graph.frame_streams if stream not in made]
         self._waiting: dict[str, deque[Token]] = {stream: deque() for stream in self._entry_streams}
@@ -138,18 +137,18 @@ class FrameAssembler:
     def frames(self, events: Iterable[Event]) -> Iterator[ReadyFrame]:
         """The frames of the log, as soon as each is ready."""
         log_time = 0
-        for message in _checked(events, self._wanted):
+        for message in _checked(events, self.wanted):
             log_time, stream, item = message.log_time, message.stream, message.item
             for name, aligner in self._aligners.items():
                 self._answer(name, log_time, aligner.tick(log_time))
             if isinstance(item, Exception):
                 self._lose(Loss(stream, log_time, "source", LossReason.UNREADABLE, str(item)))
-            elif stream in self._wanted:
+            elif stream in self.wanted:
                 self.messages[stream] += 1
                 if message.fault:
                     self._lose(Loss(stream, item.stamp, "source", LossReason.OUT_OF_ORDER, message.fault))
                 else:
-                    if stream == self._odometry and self._selection:
+                    if stream == self._selection.odometry:
                         self._selection.note(item)
                     if not self._leaves_out(stream, item.stamp):
                         self._take(stream, log_time, Token(item.stamp, item))
@@ -188,7 +187,7 @@ class FrameAssembler:
 
     def _leaves_out(self, stream: str, stamp: int) -> bool:
         """Whether a stamp of `stream` begins a frame that is left out."""
-        return self._selection is not None and stream == self._clock and not self._selection.takes(stamp)
+        return stream == self._clock and not self._selection.takes(stamp)
 
     def _lose(self, entry: Loss) -> None:
         self._entries.append(self._ledger.add(entry))

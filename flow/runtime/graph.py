@@ -136,12 +136,12 @@ class Graph:
         made = {node.name for node in self.nodes}
         return {stream for node in self.nodes for stream in node.inputs.values()} - made
 
-    def upstream_of(self, streams: Iterable[str]) -> Graph:
-        """The graph of some streams and all that they depend on."""
-        needed = set(streams)
+    def upstream_of(self, streams: Iterable[str], given: Collection[str] = ()) -> Graph:
+        """The graph of some streams and all that they depend on, up to the streams given."""
+        needed = set(streams) - {*given}
         for node in reversed(self.nodes):  # every node comes after its inputs
             if node.name in needed:
-                needed.update(node.inputs.values())
+                needed |= {*node.inputs.values()} - {*given}
         return replace(self, nodes=tuple(node for node in self.nodes if node.name in needed))
 
     def without(self, missing: Mapping[str, str]) -> Graph:

@@ -152,7 +152,6 @@ def run(
     graph = prepared.graph
     sinks = _Outputs.of(graph, outputs)
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
-    streams = graph.source_streams | ({selection.odometry} if selection.odometry else set())
     engine = Engine(
         graph.stages, sinks.sinks, ledger, workers=workers, max_frames=workers + 1, on_frame=on_frame, states=states
     )
@@ -162,7 +161,7 @@ def run(
         facts = {**(about or {}), "surveys": surveys, "fixed": fixed}
         if not stop.finishing() and sinks.open(graph.frame_streams, facts):
             started = time.perf_counter() - wall
-            at_end = _feed(assembler, _read(log.events(streams), stop), engine, stop)
+            at_end = _feed(assembler, _read(log.events(assembler.wanted), stop), engine, stop)
     finally:
         engine.finish(stop.abandoning)
         sinks.errors += [engine.failure] if engine.failure else []

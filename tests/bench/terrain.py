@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -28,7 +27,6 @@ from scipy.spatial.transform import Rotation
 from flow.align import Token
 from flow.cli import arguments
 from flow.config.loader import load
-from flow.runtime.evaluate import needed
 from flow.runtime.graph import Graph
 from flow.runtime.malloc import keep_freed_memory
 from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
@@ -91,12 +89,12 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
 def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     """The tilt as the pipeline's own aligner makes it of the inclinometer's samples about a frame."""
     number = int((stamp - simulation.begin) * 1e-9 * TILT_RATE)
-    samples, noise = deque[Token](), TiltNoise()
+    aligner = next(node.actor for node in graph_of(pipeline).nodes if node.name == "tilt")
+    state, noise = aligner.start("tilt", {"stream": "inclinometer"}), TiltNoise()
     for sample in range(max(number - WINDOW, 0), number + TILT_SAMPLES + 1):
         at = simulation.begin + round(sample / TILT_RATE * 1e9)
-        samples.append(Token(at, noise(Tilt(at, measured_up(simulation, sample, at)))))
-    aligner = next(node.actor for node in graph_of(pipeline).nodes if node.name == "tilt")
-    tilt = aligner.choose("tilt", "inclinometer", stamp, samples, " by the log's end")
+        state.samples.append(Token(at, noise(Tilt(at, measured_up(simulation, sample, at)))))
+    tilt = aligner.choose(state, stamp, " by the log's end")
     assert isinstance(tilt, Tilt), tilt
     return tilt
 
@@ -149,8 +147,8 @@ def graph_of(pipeline: str) -> Graph:
 
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:
     """The further streams up to a frame's navigation map, and the processor seconds of terrain stages."""
-    steps, streams, seconds = needed(graph_of(pipeline), streams, "navigation_map"), dict(streams), 0.0
-    for node in steps:
+    steps, streams, seconds = graph_of(pipeline).upstream_of(["navigation_map"], streams), dict(streams), 0.0
+    for node in steps.nodes:
         start = time.thread_time()
         streams[node.name] = node.actor(**{port: streams[stream] for port, stream in node.inputs.items()})
         seconds += (time.thread_time() - start) * (node.name in TERRAIN_STREAMS)
