@@ -59,13 +59,12 @@ def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> G
     text = _text(path)
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # so that stages can be beside the file that uses them
-    tree = _checked_keys(read(text, lambda line: YamlLocation(path.name, line)))
-    tree, changes = with_settings(tree, map(Change.read, overrides))
+    tree = read(text, lambda line: YamlLocation(path.name, line))
     _check_parts(tree)
+    tree, changes = with_settings(tree, map(Change.read, overrides))
     own = mapping(tree.value["templates"], "'templates'") if "templates" in tree.value else {}
-    streams = mapping(tree.value["streams"], "'streams'")
     library = Library(own)
-    expansion = Expansion(streams, library, changes)
+    expansion = Expansion(tree.value["streams"].value, library, changes)
     sinks = tree.value["sinks"].value if with_sinks else []
     return _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)
 
@@ -97,18 +96,13 @@ def shipped() -> list[str]:
     return sorted(file.stem for file in SHIPPED.glob("*.yaml"))
 
 
-def _checked_keys(tree: Value) -> Value:
-    """The file, if it has no unknown key. A misspelt key would otherwise show as a missing one."""
+def _check_parts(tree: Value) -> None:
+    """Refuse a file with an unknown key (which would otherwise show as a missing one), or without a part."""
     if tree.value is None:
         raise tree.place.error(f"the file is empty; {_BEGIN}")
     for key, value in mapping(tree, "the pipeline").items():
         if key not in _KEYS:
             raise value.place.error(f"a pipeline has no '{key}'{nearest(key, _KEYS)}")
-    return tree
-
-
-def _check_parts(tree: Value) -> None:
-    """Refuse a file without a source, streams or sinks."""
     for key in ("source", "streams", "sinks"):
         if key not in tree.value:
             raise tree.place.error(f"the pipeline has no '{key}'; {_BEGIN}")
@@ -193,8 +187,7 @@ def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -
             inputs[key] = resolved(key, value, scope)
             _check_known(inputs[key], known, value.place)
         elif key not in parameters:
-            valid = [*ports, *parameters, "use", "optional"]
-            meant = nearest(key, [*valid, *entry.inner_parameters()]) or nearest_or_all(key, valid)
+            meant = nearest_or_all(key, [*ports, *parameters, "use", "optional"])
             raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{meant}")
     for port in ports:
         if port not in inputs and port not in unneeded:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from flow.config.node_spec import mapping
 from flow.config.yaml_tree import Value, nearest_or_all, read
@@ -26,8 +25,6 @@ class Change:
         """The change that `stream.parameter=value` or `setting=value` describes."""
         path, _, text = override.partition("=")
         names = path.strip().split(".")
-        if names[0] == "sinks" and len(names) > 1:
-            names = names[1:]
         if not (text.strip() and all(names)):
             raise UsageError(f"--set {override}: write stream.parameter=value, or setting=value")
         value = read(text, lambda line: YamlLocation(f"--set {override}", None))
@@ -45,9 +42,10 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
     changes of streams are left.
     """
     given = mapping(tree.value.get("settings", Value({}, tree.place)), "'settings'")
-    settings, of_parts, of_streams, streams = dict(given), list[Change](), list[Change](), _part(tree, "streams", dict)
-    sinks = {_class_name(item): number for number, item in enumerate(_part(tree, "sinks", list))}
-    parts = {"source"} & tree.value.keys() | sinks.keys() - streams.keys()
+    settings, of_parts, of_streams = dict(given), list[Change](), list[Change]()
+    streams = mapping(tree.value["streams"], "'streams'")
+    sinks = {_class_name(item): number for number, item in enumerate(tree.value["sinks"].value)}
+    parts = {"source"} | sinks.keys() - streams.keys()
     for change in changes:
         if change.keys and change.target in parts:
             of_parts.append(change)
@@ -97,8 +95,6 @@ def filled_in(item: Value, values: Mapping[str, Value]) -> Value:
 def _unknown(change: Change, streams: Mapping[str, Value], parts: Iterable[str], settings: Mapping[str, Value]) -> str:
     """The sentence about a change whose target is neither an entry nor a setting."""
     target, keys, entries = change.target, change.keys, [*streams, *parts]
-    if keys and target == "settings":
-        return f"a setting has no prefix; write {keys[0]}=value"
     of_class = [name for name, item in streams.items() if _class_name(item).lower() == target.lower()]
     if keys and of_class:
         return f"write the stream in place of its class '{target}': {' or '.join(of_class)}"
@@ -107,12 +103,6 @@ def _unknown(change: Change, streams: Mapping[str, Value], parts: Iterable[str],
     if target in entries:
         return f"name the parameter of '{target}', as in {target}.parameter=value{nearest(target, settings)}"
     return f"the pipeline has no setting '{target}'{nearest_or_all(target, [*settings])}"
-
-
-def _part(tree: Value, key: str, kind: type) -> Any:
-    """A part of the pipeline file, empty where it is missing or of another kind; the loader reports that."""
-    value = tree.value[key].value if key in tree.value else None
-    return value if isinstance(value, kind) else kind()
 
 
 def _class_name(item: Value) -> str:
