@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 
 from flow.cli.commands import demo, export, fleet, graph, info, listing, pipeline, run, score, simulate, stages
 from flow.cli.debugging import attempt, desk, diff, report, why
-from flow.cli.importers import images, middlebury
+from flow.cli.importers import images
 from flow.cli.importers.data_sets import DATA_SETS, DataSet
 from flow.cli.replay import product_version
 from flow.contracts import nearest
@@ -42,11 +42,7 @@ COMMANDS: dict[str, ModuleType] = {
     "fleet": fleet,
     "list": listing,
 }
-_IMPORTERS: dict[str, ModuleType | DataSet] = {
-    "images": images,
-    "middlebury": middlebury,
-    **{each.kind: each for each in DATA_SETS},
-}
+_IMPORTERS: dict[str, ModuleType | DataSet] = {"images": images, **{each.kind: each for each in DATA_SETS}}
 IMPORTERS = {kind: _IMPORTERS[kind] for kind in sorted(_IMPORTERS)}
 
 

@@ -25,6 +25,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     common_size,
+    paired,
     raw_models,
 )
 from recordings.importers.rig import Rig
@@ -84,11 +85,7 @@ def _pairs(folder: Path, notes: list[str]) -> list[ImagePair]:
             names = f"{missing[0]}{' and others' if len(missing) > 1 else ''}"
             notes.append(f"{camera}/data.csv lists {counted(len(missing), 'image')} that {camera}/data lacks: {names}")
         found.append(there)
-    lefts, rights = found
-    alone = len(lefts.keys() ^ rights.keys())
-    if alone:
-        notes.append(f"{counted(alone, 'image')} without a partner of the same stamp")
-    return [ImagePair(stamp, lefts[stamp], rights[stamp]) for stamp in sorted(lefts.keys() & rights.keys())]
+    return [ImagePair(*pair) for pair in paired(found, "stamp", folder, notes)]
 
 
 def _imu(path: Path) -> Iterator[Logged]:

@@ -18,7 +18,6 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
-from flow.contracts import counted
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
 from recordings.importers.files import from_date, numbers_of, read_rows
@@ -32,6 +31,7 @@ from recordings.importers.recording import (
     Logged,
     common_size,
     fix,
+    paired,
     raw_models,
 )
 from recordings.importers.rig import MOUNT, Rig
@@ -77,14 +77,8 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
 
 def _pairs(folder: Path, notes: list[str]) -> list[ImagePair]:
     files = [{file.stem[:-2]: file for file in folder.glob(f"*_{side}.png")} for side in "01"]
-    if alone := len(files[0].keys() ^ files[1].keys()):
-        notes.append(f"{counted(alone, 'image')} of LocCam without a partner of the same time")
-    names = sorted(files[0].keys() & files[1].keys())
-    if not names:
-        raise LogError(f"{folder} contains no pair of images such as {PREFIX}2015_11_26_12_53_35_149_0.png")
-    return [
-        ImagePair(_time(name[len(PREFIX) :], str(files[0][name])), files[0][name], files[1][name]) for name in names
-    ]
+    pairs = paired(files, "time", folder, notes)
+    return [ImagePair(_time(name[len(PREFIX) :], str(left)), left, right) for name, left, right in pairs]
 
 
 def _time(text: str, where: str) -> int:

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.importers.files import nanoseconds, numbers_of, read_lines, rotation_of
 from recordings.importers.recording import (
@@ -20,6 +19,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     beside,
     common_size,
+    paired,
     rectified_models,
     tilts_of,
 )
@@ -38,14 +38,8 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     rig.need("LuSNAR", "height", "pitch_down", *AXES)
     files = [{file.name: file for file in folder.glob("*.png")} for folder in folders]
     notes = ["the tilt is derived from the poses, as the data set has no tilt sensor"]
-    if alone := len(files[0].keys() ^ files[1].keys()):
-        notes.append(f"{counted(alone, 'image')} without a partner of the same stamp")
-    pairs = [
-        ImagePair(nanoseconds(file.stem, str(file)), file, files[1][name])
-        for name, file in files[0].items() if name in files[1]
-    ]  # fmt: skip
-    if not pairs:
-        raise LogError(f"{source} contains no pair of images in image1/RGB and image2/RGB")
+    found = paired(files, "stamp", source, notes)
+    pairs = [ImagePair(nanoseconds(left.stem, str(left)), left, right) for _, left, right in found]
     pairs.sort(key=lambda pair: pair.stamp)
     size, track = common_size(pairs), _track(source / POSES, rig)
     camera = rig.camera(size, FOCAL * size[0] / WIDTH, BASELINE)

@@ -207,6 +207,23 @@ def _true_pose(recording: ImportedRecording, stamp: int, camera: Camera, tree: T
         yield stamp, "/truth/tilt", ros2.quaternion_stamped(placed.after(to_camera).rotation, stamp, LEFT)
 
 
+def paired(
+    sides: Sequence[Mapping[Any, Path]], what: str, folder: Path, notes: list[str]
+) -> Iterator[tuple[Any, Path, Path]]:
+    """Key, left and right image of the keys that both sides have, in order. A note counts the images of the others.
+
+    what: the keys in words; folder: of the images. Raises LogError if there is no pair.
+    """
+    left, right = sides
+    if alone := len(left.keys() ^ right.keys()):
+        notes.append(f"{counted(alone, 'image')} without a partner of the same {what}")
+    if left.keys().isdisjoint(right):
+        raise LogError(
+            f"{folder} contains no left and right image of the same {what}; give the folder of one recording"
+        )
+    return ((key, left[key], right[key]) for key in sorted(left.keys() & right.keys()))
+
+
 def common_size(pairs: Sequence[ImagePair]) -> tuple[int, int]:
     """Width and height of the first left image that can be read, px. Raises LogError if none can."""
     why = "there is none"

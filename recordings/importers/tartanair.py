@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.importers.files import numbers_of, of_size, read_bytes, read_rows, rotation_of
 from recordings.importers.recording import (
@@ -26,6 +25,7 @@ from recordings.importers.recording import (
     Logged,
     beside,
     common_size,
+    paired,
     rectified_models,
     tilts_of,
 )
@@ -47,21 +47,16 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
     named = next((names for names in CAMERAS if (source / f"image_{names[0]}").is_dir()), None)
     if named is None:
         raise LogError(f"{source} has no folder image_{CAMERAS[0][0]}; give the folder of one trajectory, such as P000")
-    left, right = named
+    left = named[0]
     notes = ["the tilt is derived from the poses, as the data set has no tilt sensor"]
-    found: dict[int, ImagePair] = {}
-    alone = 0
-    for file in sorted((source / f"image_{left}").glob(f"*_{left}.png")):
-        number, partner = file.name.partition("_")[0], source / f"image_{right}" / file.name.replace(left, right)
-        if number.isdecimal() and partner.exists():
-            found[int(number)] = ImagePair(FIRST_STAMP + int(number) * PERIOD_NS, file, partner)
-        else:
-            alone += 1
-    if alone:
-        notes.append(f"{counted(alone, 'image')} of image_{left} without a partner in image_{right}")
-    if not found:
-        raise LogError(f"{source} contains no pair of images in image_{left} and image_{right}")
-    pairs, track = list(found.values()), _track(source / f"pose_{left}.txt")
+    files = [
+        {int(number): file for file in source.glob(f"image_{name}/*_{name}.png")
+         if (number := file.name.partition("_")[0]).isdecimal()}
+        for name in named
+    ]  # fmt: skip
+    found = paired(files, "number", source, notes)
+    pairs = [ImagePair(FIRST_STAMP + number * PERIOD_NS, *pair) for number, *pair in found]
+    track = _track(source / f"pose_{left}.txt")
     size = common_size(pairs)
     camera = rig.camera(size, size[0] / 2, BASELINE)
     depths = [next(iter(source.glob(f"depth_{left}/{pair.left.stem}_depth.*")), None) for pair in pairs]

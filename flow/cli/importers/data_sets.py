@@ -1,4 +1,4 @@
-"""`roverflow import` of data sets whose recordings become logs, described by a rig file: one entry of a table each."""
+"""`roverflow import` of data sets whose recordings become logs: one entry of a table each."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ FILES: dict[str, Any] = {"type": Path, "nargs": "+", "metavar": "FILE"}
 class DataSet:
     """A kind of recording, which `recordings.importers.KIND.read_KIND` reads.
 
-    HELP: one line, named as in modules of commands; source: what its folder contains; rig: what its rig file says;
-    entries: that the rig file may have, by their names in `recordings.importers.rig`; options: further ones, as
-    argparse takes them, in the order in which they are read.
+    HELP: one line, named as in modules of commands; source: what its folder contains; rig: what its rig file says,
+    empty if it has none; entries: that the rig file may have, by their names in `recordings.importers.rig`; options:
+    further ones, as argparse takes them, in the order in which they are read.
     """
 
     kind: str
@@ -34,7 +34,9 @@ class DataSet:
     def add_arguments(self, sub: argparse.ArgumentParser) -> None:
         sub.add_argument("source", type=Path, metavar="SOURCE", help=self.source)
         sub.add_argument("out", type=Path, metavar="OUT.mcap", help="log to write")
-        sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"YAML file with missing data: {self.rig}")
+        sub.set_defaults(rig=None)
+        if self.rig:
+            sub.add_argument("--rig", type=Path, metavar="RIG.yaml", help=f"YAML file with missing data: {self.rig}")
         for name, option in self.options.items():
             sub.add_argument(f"--{name}", **option)
 
@@ -97,6 +99,12 @@ DATA_SETS = (
         "folder of a scene, with image1, image2 and Rover_pose.txt",
         "height and pitch_down of the camera on base_link, body_axes and world_up of the poses",
         ("MOUNT", "LENS", "AXES"),
+    ),
+    DataSet(
+        "middlebury",
+        "a Middlebury scene with ground truth (assumes a level camera 1 m above ground)",
+        "folder of a scene",
+        "",
     ),
     DataSet(
         "tartanair",

@@ -70,7 +70,7 @@ def test_a_trajectory_of_tartanair_is_the_simulators_log(tmp_path, said, cameras
     folder, own = write_tartanair(EXACT, tmp_path / "P000", cameras), own_log(EXACT, tmp_path / "own.mcap")
     log = tmp_path / "log.mcap"
     text = said(0, "import", "tartanair", folder, log, "--rig", folder / "rig.yaml").out
-    assert f"1 image of image_{cameras[0]} without a partner" in text
+    assert "1 image without a partner of the same number" in text
     assert_same(log, own, stamps=False)
     assert_same_truth(log, own)
     assert list(true_poses(log)) == [1_000_000_000 + number * 100_000_000 for number in range(3)]
