@@ -22,7 +22,7 @@ CURSOR = "cursor"  # the instant of a viewer that is open
 
 
 def count(text: str, low: int = 1) -> int:
-    """A whole number of at least 1."""
+    """A whole number of at least `low`."""
     try:
         value = int(text)
     except ValueError:
@@ -30,11 +30,6 @@ def count(text: str, low: int = 1) -> int:
     if value < low:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least {low}, not '{text}'")
     return value
-
-
-def count_or_none(text: str) -> int:
-    """A whole number of at least 0."""
-    return count(text, low=0)
 
 
 def workers(text: str) -> int:

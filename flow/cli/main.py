@@ -11,7 +11,7 @@ import logging
 import re
 import sys
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from types import ModuleType
 from typing import Any, NoReturn
 
@@ -65,32 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace:
     """The options of a command line. An unknown name ends the program with the nearest valid one."""
-    top = parser()
-    for place, (what, name, known) in enumerate(_named(given)):
-        if not name.startswith("-") and name not in known:
-            remedy = f"; {' '.join([top.prog, *given[:place]])} --help lists them"
-            _refuse(top, f"there is no {what} '{name}'", name, known, remedy)
-    options, unknown = top.parse_known_args(_joined(given) or ["--help"])
+    options, unknown = parser().parse_known_args(_joined(given) or ["--help"])
     if unknown:
         valid = [option for action in options.parser._actions for option in action.option_strings]
+        near = [each for each in valid if nearest(unknown[0].lstrip("-"), [each.lstrip("-")])]  # all share the dashes
         pipeline = ", and --set STREAM.PARAM=VALUE changes the pipeline" if "--set" in valid else ""
-        remedy = f"; {options.parser.prog} --help lists the options{pipeline}"
-        _refuse(options.parser, f"unknown: {' '.join(unknown)}", unknown[0], valid, remedy)
+        remedy = nearest(unknown[0], near) or f"; {options.parser.prog} --help lists the options{pipeline}"
+        options.parser.error(f"unknown: {' '.join(unknown)}{remedy}")
     return options
-
-
-def _refuse(parser: argparse.ArgumentParser, why: str, name: str, valid: Sequence[str], remedy: str) -> NoReturn:
-    """End the program with the usage of a command and the valid name nearest to `name`, or else the remedy."""
-    near = [each for each in valid if nearest(name.lstrip("-"), [each.lstrip("-")])]  # all options share the dashes
-    parser.error(f"{why}{nearest(name, near) or remedy}")
-
-
-def _named(given: Sequence[str]) -> Iterator[tuple[str, str, Sequence[str]]]:
-    """What the first words of a command line name: (what, name, valid names)."""
-    if given:
-        yield "command", given[0], [*COMMANDS, "import"]
-    if len(given) > 1 and given[0] == "import":
-        yield "kind of import", given[1], [*IMPORTERS]
 
 
 def _joined(given: Sequence[str]) -> list[str]:
@@ -129,12 +111,22 @@ def _exit_code(error: BaseException) -> int:
 
 
 class CommandParser(argparse.ArgumentParser):
-    """Names all that a command line lacks at once. argparse itself names alternatives only when the rest is there."""
+    """Names all that a command line lacks at once, and the nearest valid name of a command, a desk and the like.
+
+    argparse itself names alternatives only when the rest is there.
+    """
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """The options and the unknown words of a command line."""
         self._given = argparse.Namespace() if namespace is None else namespace
         return super().parse_known_args(args, self._given)
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += nearest(value, action.choices or ())
+            raise
 
     def error(self, message: str) -> NoReturn:
         """End the program with the usage and a sentence."""

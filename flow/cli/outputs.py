@@ -64,8 +64,6 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
                 raise UsageError(f"{path} is an input of this command; choose another name for the output")
         if (resolved := os.path.realpath(path)) in taken:
             raise UsageError(f"{path} is given for two outputs; choose another name for one")
-        if path.suffix.lower() == ".mcap" and not kind.endswith("log"):
-            raise UsageError(f"{path} is named like a log; give the {kind} another name")
         if path.exists() and not is_ours(path, kind):
             raise UsageError(f"{path} exists and is not a roverflow {kind}; choose another name or remove it")
         noun = "log" if kind.endswith("log") else kind

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import Field, dataclass, is_dataclass
 from types import UnionType
@@ -114,7 +114,7 @@ def class_at(use: str, place: YamlLocation) -> type:
     """The dataclass that an entry at this place names."""
     module_name, _, name = use.rpartition(".")
     try:
-        module = importlib.import_module(module_name)
+        __import__(module_name)  # it has no line of its own in a traceback, unlike importlib.import_module
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
             raise place.error(f"cannot import '{module_name}': {error}") from error
@@ -122,10 +122,8 @@ def class_at(use: str, place: YamlLocation) -> type:
         remedy = "set PYTHONPATH to its folder"
         raise place.error(f"there is no module '{error.name}' {where} or on the Python path; {remedy}") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
-        trace = error.__traceback__
-        while trace is not None and trace.tb_frame.f_code.co_name != "<module>":  # of the import itself
-            trace = trace.tb_next
-        raise place.error(f"cannot import '{module_name}': {failure(error.with_traceback(trace))}") from error
+        raise place.error(f"cannot import '{module_name}': {failure(error)}") from error
+    module = sys.modules[module_name]
     kind = getattr(module, name, None)
     if isinstance(kind, type) and is_dataclass(kind):
         if any(isinstance(value, Field) for value in vars(kind).values()):  # a base is a dataclass

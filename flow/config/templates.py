@@ -127,18 +127,15 @@ class Library:
         """The template that `template: name` means."""
         if not isinstance(name.value, str) or not name.value:
             raise name.place.error(f"'template: {name.plain()}' must be the name of a template")
-        if name.value not in self._known:
-            self._known[name.value] = self._read(name)
-        return self._known[name.value]
-
-    def _read(self, name: Value) -> Template:
         parts = {file.stem: file for file in (SHIPPED / "parts").glob("*.yaml")}
-        if name.value not in parts:
+        if name.value not in (*self._known, *parts):
             meant = nearest(name.value, [*self._known, *parts]) or "; write it under 'templates' in the pipeline file"
             raise name.place.error(f"there is no template '{name.value}'{meant}")
-        shown, text = f"parts/{name.value}.yaml", parts[name.value].read_text(encoding="utf-8")
-        self._texts[shown] = text
-        return Template.read(name.value, read(text, lambda line: YamlLocation(shown, line)))
+        if name.value not in self._known:
+            shown, text = f"parts/{name.value}.yaml", parts[name.value].read_text(encoding="utf-8")
+            self._texts[shown] = text
+            self._known[name.value] = Template.read(name.value, read(text, lambda line: YamlLocation(shown, line)))
+        return self._known[name.value]
 
 
 class Expansion:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from flow.cli.arguments import AT, count, count_or_none, instant, workers
+from flow.cli.arguments import AT, count, instant, workers
 from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.cli.outputs import add_log, check_outputs
 from flow.cli.report import say
@@ -31,7 +32,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--frames", type=count, default=1, metavar="N", help="number of frames from that instant on (1)")
     before = "frames to run before it, for stages with state: regional map, pose, tilt check (0)"
     state = sub.add_mutually_exclusive_group()
-    state.add_argument("--before", type=count_or_none, default=0, metavar="N", help=before)
+    state.add_argument("--before", type=partial(count, low=0), default=0, metavar="N", help=before)
     logged = "result log of the whole run: supplies pipeline A, and the regional map and pose to begin with"
     state.add_argument("--result", type=Path, metavar="OUT.mcap", help=logged)
     sub.add_argument("-p", "--pipeline", help="rover, fast, accurate, paper, or a YAML file (rover)")

@@ -280,7 +280,7 @@ def own(field="int", takes="couple: Couple", returns="Couple"):
     )),
 ])  # fmt: skip
 def test_a_mistake_in_a_module_of_ones_own_is_named_with_its_line(tmp_path, source, replaced, entry, message):
-    module = tmp_path.name
+    module = f"own_{tmp_path.name}"
     (tmp_path / f"{module}.py").write_text(source)
     with pytest.raises(PipelineError, match=re.escape(f"toy.yaml:{message.replace('MODULE', module)}")) as caught:
         loaded(tmp_path, GOOD.replace(replaced, f"{module}.{entry}"))
