@@ -2,7 +2,6 @@
 
 import threading
 import time
-import weakref
 from dataclasses import replace
 
 import pytest
@@ -13,7 +12,7 @@ from flow.contracts import Absent, Loss, LossReason
 from flow.runtime.engine import Engine
 from flow.runtime.graph import Node, YamlLocation
 from flow.runtime.ledger import Ledger
-from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, Scale, graph, replayed, traverse
+from tests.flow.toys import MS, PIPELINE, Couple, Keep, Number, graph, replayed, traverse
 
 
 def test_every_stream_of_every_frame_arrives_in_stamp_order(tmp_path):
@@ -48,56 +47,6 @@ sinks: [{{use: tests.flow.toys.Keep}}]
     gate.set()
     engine.finish()
     assert calls == [0, 0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
-
-
-def test_inboxes_stay_bounded_when_the_end_of_the_line_is_slow(tmp_path):
-    pipeline = graph(tmp_path)
-    gate, inside, most = threading.Event(), [], []
-
-    class Slow(Keep):
-        def write(self, record):
-            gate.wait(5)
-            super().write(record)
-
-    sink = Slow()
-    bounds = {"workers": 3, "capacity": 2, "on_frame": lambda whole: inside.pop()}
-    engine = Engine(pipeline.stages, {"slow": (sink, ["sum"])}, Ledger(), **bounds)
-
-    def release():
-        gate.wait(0.3)
-        most.append(len(inside))
-        gate.set()
-
-    helper = threading.Thread(target=release)
-    helper.start()
-    for index in range(60):
-        inside.append(index)
-        engine.admit(index, frame(index), [])
-    engine.finish()
-    helper.join()
-    assert most[0] <= 2 * (len(pipeline.stages) + 1) + 3
-    assert [record.index for record in sink.records] == list(range(60))
-
-
-def test_an_item_is_freed_once_its_last_reader_is_done(tmp_path, monkeypatch):
-    stages, scale, made, alive = graph(tmp_path).stages, Scale.__call__, [], []
-
-    def noted(self, couple):
-        result = scale(self, couple)
-        made.append(weakref.ref(result))
-        return result
-
-    class Looking(Keep):
-        def write(self, record):
-            alive.extend(reference() for reference in made)
-            super().write(record)
-
-    monkeypatch.setattr(Scale, "__call__", noted)
-    engine = Engine(stages, {"sum": (sink := Looking(), ["sum"])}, Ledger(), workers=1)
-    engine.admit(0, frame(1), [])
-    engine.finish()
-    assert alive == [None, None]
-    assert (list(sink.values("sum").values()), engine.complete) == ([5.0], 1)
 
 
 class SlowAdd:

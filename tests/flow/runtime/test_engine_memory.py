@@ -26,9 +26,9 @@ class Encoding(Keep):
         return f"{stream} {item.value:g}"
 
 
-def run_with(sink, pipeline, frames, workers=2):
+def run_with(sink, pipeline, frames, workers=2, streams=("both", "twice", "thrice")):
     ledger = Ledger()
-    engine = Engine(pipeline.stages, {"sink": (sink, ["both", "twice", "thrice"])}, ledger, workers=workers)
+    engine = Engine(pipeline.stages, {"sink": (sink, streams)}, ledger, workers=workers)
     for index in range(frames):
         engine.admit(index, {"both": Couple(index, float(index)), "height": Couple(index, 0.0)}, [])
     engine.finish()
@@ -60,20 +60,24 @@ def test_a_sink_that_cannot_prepare_an_item_stops_the_run(tmp_path):
     assert failed == [("sink", "OSError: cannot encode")]
 
 
-def test_a_prepared_item_is_let_go_before_the_frame_is_written(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("kind", "streams"), [(Keep, ["sum"]), (Encoding, ["twice", "thrice"])])
+def test_an_item_is_let_go_once_it_is_read_or_prepared(tmp_path, monkeypatch, kind, streams):
     made, alive, scale = [], [], Scale.__call__
 
     def noted(self, couple: Couple) -> Couple:
         made.append(weakref.ref(result := scale(self, couple)))
         return result
 
-    class Looking(Encoding):
-        def write(self, record):
-            alive.extend(reference() for reference in made)
+    def looking(self, record):
+        alive.extend(reference() for reference in made)
+        write(self, record)
 
+    write, sink = Keep.write, kind()
+    monkeypatch.setattr(Keep, "write", looking)
     monkeypatch.setattr(Scale, "__call__", noted)
-    run_with(Looking(), graph(tmp_path), 1, workers=1)
+    engine, _ = run_with(sink, graph(tmp_path), 1, workers=1, streams=streams)
     assert alive == [None, None]
+    assert (list(sink.records[0].items), engine.complete) == (streams, 1)
 
 
 @pytest.mark.parametrize(("workers", "at_once"), [(1, 1), (2, 1), (4, 2)])
