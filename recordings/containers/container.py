@@ -1,16 +1,28 @@
-"""What the source needs of a file with messages. A container says how messages are encoded; it does not decode them.
+"""A file with messages. A container says how messages are encoded; it does not decode them.
 
-To read another format, write a class with the members of `Container` and name it in `opening.py`.
+To read another format, write a subclass of `Container` and name it in `opening.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sized
 from dataclasses import dataclass
+from heapq import merge
+from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, TypeVar
 
-from recordings.containers.timeline import Timeline
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.containers.timeline import Places, Timeline
+from recordings.errors import LogError
+
+HEAD_BYTES = 64  # of a message; they contain the stamp of its header
+MAX_STORED_BYTES = 1 << 27  # of a message as stored; 21 million pixels in colour have half of it
+MAX_OPEN_BYTES = 1 << 27  # of unpacked chunks that overlap in time, while another one is unpacked
+_READ_AT_ONCE = 10_000  # places
 
 
 class RawMessage(NamedTuple):
@@ -52,51 +64,97 @@ class Channel:
     schema: MessageSchema | None
 
 
-class Container(Protocol):
+class Container(ABC):
     """A file open for reading.
 
-    path: the file; size: bytes; start, end: log time of the first and the last message, ns.
+    path: the file; size: bytes; start, end: log time of the first and the last message, ns; channels: by number;
+    timeline: channel and log time of every message, in file order; lost: the damage; profile: that an MCAP file states;
+    indexed: whether the file has a valid index; otherwise it was read through.
     """
 
     path: Path
     size: int
     start: int
     end: int
-
-    @property
-    def channels(self) -> Mapping[int, Channel]:
-        """The channels by number."""
-
-    @property
-    def lost(self) -> Sequence[LostMessage]:
-        """The damage known so far."""
-
-    @property
-    def profile(self) -> str:
-        """The profile that an MCAP file states."""
-
-    @property
-    def indexed(self) -> bool:
-        """Whether the file has a valid index; otherwise it was read through."""
-
-    @property
-    def timeline(self) -> Timeline:
-        """Channel and log time of every message, in file order."""
+    channels: Mapping[int, Channel]
+    timeline: Timeline
+    lost: list[LostMessage]
+    profile: str
+    indexed: bool
 
     def messages(
         self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
     ) -> Iterator[RawMessage | LostMessage]:
-        """The messages of `channels` with start <= log time < end, ns, in log-time order.
+        """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
         A `LostMessage` stands at the log time of lost messages; if that time is unknown, at the end. places: of the
         messages in the timeline; None: all.
         """
+        timeline, low, high = self.timeline, start or 0, 1 << 64 if end is None else end
+        found = self._read(timeline.chosen(channels, start, end, places))
+        lost = list[LostMessage]()
+        if places is None or places.stop >= len(timeline):
+            why = "the message is lost: its log time is damaged"
+            untimed = timeline.channels[timeline.log_times < 0].tolist()
+            lost = [LostMessage(channel, self.end, why) for channel in untimed if channel in channels]
+            lost = sorted((item for item in self.lost + lost if low <= item.log_time < high), key=_time_of)
+        return merge(found, lost, key=_time_of) if lost else found
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """At least the first bytes of the messages of `channels`, with their headers, in any order and not verified."""
+        return self.messages(channels)
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
+        return self.timeline.count(channels)
 
+    @abstractmethod
     def close(self) -> None:
         """Close the file."""
+
+    @abstractmethod
+    def _read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
+        """The messages at some places of the timeline, in that order."""
+
+    def _ends(self, why: str = "") -> tuple[int, int]:
+        """The log time of the first and the last message. Raises LogError if there is none; `why` may be known."""
+        times = self.timeline.log_times[self.timeline.log_times >= 0]
+        if not times.size:
+            damage = f" that can be read: {self.lost[0].reason}" if self.lost else "; record it again"
+            raise LogError(f"{self.path} contains no messages{why or damage}")
+        return int(np.min(times)), int(np.max(times))
+
+
+_time_of = attrgetter("log_time")
+
+
+def blocks(places: Places) -> Iterator[Places]:
+    """Some places after the others, as a list of Python's numbers takes more memory than an array."""
+    return (places[first : first + _READ_AT_ONCE] for first in range(0, len(places), _READ_AT_ONCE))
+
+
+Chunk = TypeVar("Chunk", bound=Sized)
+
+
+class OpenChunks(Generic[Chunk]):
+    """The unpacked chunks of messages that are read one after the other.
+
+    A chunk is let go after its last message. Beyond `MAX_OPEN_BYTES` the one unpacked first is, and is unpacked again
+    when due. due: the number of the chunk of each message.
+    """
+
+    def __init__(self, due: NDArray[np.integer[Any]], unpack: Callable[[int], Chunk]) -> None:
+        self._unpack, self._due = unpack, np.bincount(due)
+        self._open: dict[int, Chunk] = {}
+
+    def of_next(self, number: int) -> Chunk:
+        """The chunk of the next message."""
+        if number not in self._open:
+            while sum(map(len, self._open.values())) > MAX_OPEN_BYTES:
+                del self._open[next(iter(self._open))]
+            self._open[number] = self._unpack(number)
+        found = self._open[number]
+        self._due[number] -= 1
+        if not self._due[number]:
+            del self._open[number]
+        return found

@@ -11,22 +11,31 @@ from array import array
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flow.contracts import counted
-from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
-from recordings.containers.timeline import Timeline
+from recordings.containers.container import (
+    HEAD_BYTES,
+    MAX_STORED_BYTES,
+    Channel,
+    Container,
+    LostMessage,
+    MessageSchema,
+    RawMessage,
+    blocks,
+)
+from recordings.containers.timeline import Places, Timeline
 from recordings.errors import LogError, sentence_of
-from recordings.mcap.chunk import HEAD_BYTES, MAX_STORED_BYTES
 
 _ROWS_AT_ONCE = 1000
 _CHECKPOINT = "import sqlite3, sys; sqlite3.connect(sys.argv[1]).execute('PRAGMA wal_checkpoint')"
 
 
-class Db3File:
+class Db3File(Container):
     """A rosbag2 SQLite file open for reading.
 
     A file of ROS 2 Humble or earlier has no definitions of its types; their texts are empty then. Raises LogError for a
@@ -44,11 +53,9 @@ class Db3File:
         try:
             self._database.execute("PRAGMA writable_schema = ON")  # otherwise nothing of a cut file is read
             self.channels = self._read_channels()
-            times = self.timeline.log_times[self.timeline.log_times >= 0]
-            if not times.size:
-                damage = f" that can be read: {self.lost[0].reason}" if self.lost else "; record it again"
-                raise LogError(f"{path} contains no messages{self._unwritten or damage}")
-            self.start, self.end = int(np.min(times)), int(np.max(times))
+            self._rows = self._read_columns()
+            self.timeline = Timeline(self._rows[1], np.maximum(self._rows[2], -1, out=self._rows[2]))
+            self.start, self.end = self._ends(self._unwritten)
             if self._unwritten:
                 self.lost.append(LostMessage(None, self.end, self._unwritten.removeprefix("; ")))
         except (sqlite3.Error, TypeError, ValueError, OverflowError) as error:  # a column may have any type
@@ -58,45 +65,21 @@ class Db3File:
             self.close()
             raise
 
-    @cached_property
-    def timeline(self) -> Timeline:
-        """Channel and log time of every message, in the order of recording."""
-        return Timeline(self._rows[1], np.maximum(self._rows[2], -1, out=self._rows[2]))
+    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
+        """The first bytes of the messages of some channels, with their headers."""
+        return chain(self._read(self.timeline.places_of(channels), HEAD_BYTES), self.lost)
 
-    def messages(
-        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
-    ) -> Iterator[RawMessage | LostMessage]:
-        """The messages of some channels in log-time order; see `Container`."""
-        return self._read(channels, start, end, places, MAX_STORED_BYTES)
-
-    def _read(
-        self, channels: set[int], start: int | None, end: int | None, places: range | None, size: int
-    ) -> Iterator[RawMessage | LostMessage]:
-        """The first `size` bytes of messages; the rest as in `messages`."""
-        timeline = self.timeline
-        chosen = timeline.chosen(channels, start, end, places)
-        for first in range(0, len(chosen), _ROWS_AT_ONCE):
-            block = chosen[first : first + _ROWS_AT_ONCE]
-            columns = (column[block].tolist() for column in (timeline.channels, timeline.log_times, self._rows[0]))
+    def _read(self, places: Places, size: int = MAX_STORED_BYTES) -> Iterator[RawMessage | LostMessage]:
+        """The first `size` bytes of the messages at some places of the timeline."""
+        for block in blocks(places):
+            wanted = self.timeline.channels, self.timeline.log_times, self._rows[0]
+            columns = (column[block].tolist() for column in wanted)
             for channel, log_time, row in zip(*columns, strict=True):
                 data = self._data_or_reason(row, size)
                 if isinstance(data, str):
                     yield LostMessage(channel, log_time, data)
                 else:
                     yield RawMessage(channel, log_time, data)
-        if end is None and (places is None or places.stop >= len(timeline)):
-            damaged = np.isin(timeline.channels, sorted(channels)) & (timeline.log_times < 0)
-            for channel in timeline.channels[damaged].tolist():
-                yield LostMessage(channel, self.end, "the message is lost: its log time is damaged")
-            yield from self.lost
-
-    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
-        """The first bytes of the messages of some channels, with their headers."""
-        return self._read(channels, None, None, None, HEAD_BYTES)
-
-    def count(self, channels: set[int]) -> int:
-        """The number of messages in some channels."""
-        return self.timeline.count(channels)
 
     def close(self) -> None:
         """Close the file."""
@@ -122,8 +105,7 @@ class Db3File:
             for number, topic, kind, encoding in rows
         }
 
-    @cached_property
-    def _rows(self) -> tuple[NDArray[np.int64], ...]:
+    def _read_columns(self) -> tuple[NDArray[np.int64], ...]:
         """Row, channel and log time, ns, of every message, in the order of recording."""
         columns = array("q"), array("q"), array("q")
         try:

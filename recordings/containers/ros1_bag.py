@@ -8,27 +8,30 @@ from __future__ import annotations
 
 import bz2
 from collections.abc import Iterator
-from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 
 import lz4.frame
-import numpy as np
 from rosbags.rosbag1 import ReaderError
 from rosbags.rosbag1.reader import Compression, Header, RecordType, decompressors, read_bytes, read_uint32
 
 from flow.contracts import counted
 from recordings.containers.bag_index import BagIndex
-from recordings.containers.container import Channel, LostMessage, MessageSchema, RawMessage
-from recordings.containers.timeline import Timeline
+from recordings.containers.container import (
+    Channel,
+    Container,
+    LostMessage,
+    MessageSchema,
+    OpenChunks,
+    RawMessage,
+    blocks,
+)
+from recordings.containers.timeline import Places, Timeline
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, Unpacking, max_unpacked
-from recordings.mcap.message_order import MAX_OPEN_BYTES
-
-_ROWS_AT_ONCE = 10_000
 
 
-class Ros1Bag:
+class Ros1Bag(Container):
     """A ROS 1 bag open for reading, also without an index. Raises LogError for a bag without readable messages."""
 
     profile = "ros1"
@@ -53,57 +56,28 @@ class Ros1Bag:
                 number: Channel(number, connection.topic, "ros1", _schema(connection))
                 for number, connection in enumerate(self._bag.connections)
             }
+            _, channels, entries = self._bag.entries
+            self.timeline = Timeline(channels, entries["time"])
             if unknown := len(self._bag) - len(self.timeline):
                 lost.append(f"{counted(unknown, 'message')} of an undefined connection cannot be read")
-            if not len(self.timeline):
-                raise LogError(f"{path} contains no messages; record it again")
-            times = self.timeline.log_times
-            self.start, self.end = int(np.min(times)), int(np.max(times))
+            self.start, self.end = self._ends()
             self.lost += [LostMessage(None, self.end, why) for why in lost]
         except BaseException:
             self.close()
             raise
 
-    @cached_property
-    def timeline(self) -> Timeline:
-        """Channel and log time of every message, in file order."""
-        _, channels, entries = self._bag.entries
-        return Timeline(channels, entries["time"])
-
-    def messages(
-        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
-    ) -> Iterator[RawMessage | LostMessage]:
-        """The messages of some channels in log-time order; see `Container`."""
+    def _read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
+        """The messages at some places of the timeline."""
         timeline, (of_chunk, _, entries) = self.timeline, self._bag.entries
-        chosen = timeline.chosen(channels, start, end, places)
-        waiting, chunks = np.bincount(of_chunk[chosen], minlength=len(self._bag.places)), dict[int, bytes | str]()
-        for first in range(0, len(chosen), _ROWS_AT_ONCE):
-            block = chosen[first : first + _ROWS_AT_ONCE]
+        opened = OpenChunks(of_chunk[places], lambda number: self._unpacked(self._bag.places[number]))
+        for block in blocks(places):
             columns = of_chunk[block], entries["offset"][block], timeline.channels[block], timeline.log_times[block]
             for number, offset, channel, log_time in zip(*(column.tolist() for column in columns), strict=True):
-                chunk = self._bag.places[number]
-                if chunk not in chunks:
-                    chunks[chunk] = self._unpacked(chunk)
-                    while len(chunks) > 1 and sum(map(len, chunks.values())) > MAX_OPEN_BYTES:
-                        del chunks[next(iter(chunks))]  # it is unpacked again when due
-                found = _message_at(chunks[chunk], chunk, offset)
+                found = _message_at(opened.of_next(number), self._bag.places[number], offset)
                 if isinstance(found, str):
                     yield LostMessage(channel, log_time, found)
                 else:
                     yield RawMessage(channel, log_time, found)
-                waiting[number] -= 1
-                if not waiting[number]:
-                    chunks.pop(chunk, None)
-        if end is None and (places is None or places.stop >= len(timeline)):
-            yield from self.lost
-
-    def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
-        """The messages of some channels; they have to be read as a whole."""
-        return self.messages(channels)
-
-    def count(self, channels: set[int]) -> int:
-        """The number of messages in some channels."""
-        return self.timeline.count(channels)
 
     def close(self) -> None:
         """Close the file."""

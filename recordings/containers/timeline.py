@@ -71,5 +71,5 @@ class Timeline:
         if places is not None:
             found = found[slice(*np.searchsorted(found, [places.start, places.stop]))]
         times = self.log_times[found]
-        found = found[(times >= (start or 0)) & (times < (end if end is not None else 1 << 62))]
+        found = found[(times >= (start or 0)) & (times < (MAX_LOG_TIME + 1 if end is None else end))]
         return found[np.argsort(self.log_times[found], kind="stable")]

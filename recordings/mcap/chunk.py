@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import re
 import struct
+from array import array
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import lz4.frame
+import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from recordings.errors import LogError
-from recordings.mcap.index import RECORD, Index, read_at
+from recordings.mcap.index import MESSAGE, RECORD, read_at
 
 MAX_CHUNK_BYTES = 1 << 28  # of a chunk or message, unpacked; recorders make chunks of a few MB
-MAX_STORED_BYTES = 1 << 27  # of a message as stored; 21 million pixels in colour have half of it
-HEAD_BYTES = 64  # of a message; they contain the stamp of its header
 MAX_RATIO = 200  # of unpacked to packed bytes; more is a hostile file
 _FREE_BYTES, _FREE_FILE_BYTES = 1 << 26, 1 << 30  # to which any chunk, and any file, may unpack
 _FREE_PARTS_BYTES = 1 << 31  # likewise; some parts are unpacked several times
@@ -58,9 +59,8 @@ def max_unpacked(packed: int) -> int:
     return min(MAX_CHUNK_BYTES, max(_FREE_BYTES, MAX_RATIO * packed))
 
 
-def check_size(index: Index, path: Path, size: int) -> None:
-    """Raise LogError for a file whose chunks unpack to more than those of a recording could. size: of the file."""
-    total = sum(chunk.uncompressed_size for chunk in index.chunks)
+def check_size(path: Path, size: int, total: int) -> None:
+    """Raise LogError for a file of `size` bytes whose chunks unpack to more than those of a recording could."""
     if total > max(_FREE_FILE_BYTES, MAX_RATIO * size):
         raise LogError(f"{path} unpacks to {total} bytes, {total // size} times its size, unlike any recording")
 
@@ -92,12 +92,12 @@ def find_chunk(file: BinaryIO, position: int, size: int) -> int | None:
     return None
 
 
-def chunk_start_time(content: bytes) -> int:
+def chunk_start_time(content: Buffer) -> int:
     """The log time of a chunk's first message, ns, as its record states it."""
     return int(_CHUNK.unpack_from(content)[0])
 
 
-def unpack_chunk(content: bytes) -> bytes | memoryview:
+def unpack_chunk(content: Buffer) -> Buffer:
     """The decompressed records of a chunk. Raises ValueError where the size or the CRC does not match."""
     _, _, size, checksum, _ = _CHUNK.unpack_from(content)
     compression, packed, length = _split_chunk(content)
@@ -135,13 +135,57 @@ def chunk_heads(file: BinaryIO, position: int, offsets: Sequence[int], size: int
         raise ValueError(f"the start of a chunk in '{compression}' cannot be read alone")
 
 
-def unpack_cut_chunk(content: bytes) -> bytes | memoryview:
+class ChunkTable:
+    """Channel, log time and place of each message in records. Raises ValueError for a cut record, if not `is_cut`.
+
+    stated: the channels by the message index; a damaged one may have the messages in another order.
+    """
+
+    def __init__(self, records: Buffer, is_cut: bool = False, stated: NDArray[Any] | None = None) -> None:
+        self.records = memoryview(records)
+        self.channels, self.times, self.starts, self.ends = array("H"), array("Q"), array("Q"), array("Q")
+        position, size, message = 0, len(self.records), int(Opcode.MESSAGE)
+        while position < size:
+            start = position + RECORD.size
+            opcode, length = RECORD.unpack_from(self.records, position) if start <= size else (0, size)
+            position = start + length
+            if position > size:
+                if is_cut:
+                    break
+                raise ValueError("a record is longer than its section")
+            if opcode == message:
+                if length < MESSAGE.size:
+                    raise ValueError("a message is cut short")
+                channel, _, log_time, _ = MESSAGE.unpack_from(self.records, start)
+                self.channels.append(channel)
+                self.times.append(log_time)
+                self.starts.append(start + MESSAGE.size)
+                self.ends.append(position)
+        self._order: Sequence[int] = range(len(self.times))
+        if stated is not None and not np.array_equal(self.channels, stated):
+            own, other = (np.argsort(channels, kind="stable") for channels in (self.channels, stated))
+            if not np.array_equal(np.asarray(self.channels)[own], stated[other]):
+                raise ValueError("its message index has other messages")
+            self._order = own[np.argsort(other)].tolist()
+
+    def __len__(self) -> int:
+        """The number of bytes."""
+        return len(self.records)
+
+    def message(self, number: int) -> tuple[int, memoryview]:
+        """Log time, ns, and bytes of a message; of a short one a copy, so that it keeps no chunk in memory."""
+        place = self._order[number]
+        data = self.records[self.starts[place] : self.ends[place]]
+        return self.times[place], data if 2 * len(data) >= len(self.records) else memoryview(bytes(data))
+
+
+def unpack_cut_chunk(content: Buffer) -> Buffer:
     """The part of a cut chunk that can still be decompressed. Its CRC cannot be checked."""
     compression, packed, _ = _split_chunk(content)
     return _decompress(compression, packed, _CHUNK.unpack_from(content)[2])
 
 
-def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memoryview:
+def _decompress(compression: str, packed: memoryview, size: int) -> Buffer:
     """At most size + 1 bytes of the decompressed content."""
     limit = max_unpacked(len(packed))
     if size > limit:
@@ -158,7 +202,7 @@ def _decompress(compression: str, packed: memoryview, size: int) -> bytes | memo
     raise ValueError(f"unknown compression '{compression}' (supported: zstd, lz4, none)")
 
 
-def _split_chunk(content: bytes) -> tuple[str, memoryview, int]:
+def _split_chunk(content: Buffer) -> tuple[str, memoryview, int]:
     """The compression's name, the compressed bytes, and their stated number."""
     name_end = _CHUNK.size + _CHUNK.unpack_from(content)[-1]
     (length,) = struct.unpack_from("<Q", content, name_end)

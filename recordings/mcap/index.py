@@ -1,7 +1,6 @@
-"""The index of an MCAP file: where its chunks and messages are, and from what time.
+"""The index of an MCAP file: its chunks, and the channel and log time of every message.
 
-`index_from_summary` reads it from a complete summary section; otherwise `recordings.mcap.walk` builds it. Only the walk
-knows the time of every message.
+`index_from_summary` reads it from a complete summary section; otherwise `recordings.mcap.walk` builds it.
 """
 
 from __future__ import annotations
@@ -14,16 +13,18 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
+import numpy as np
 import zstandard
 from isal.isal_zlib import crc32
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Footer, Header, Schema, Statistics
+from numpy.typing import NDArray
 
-from recordings.containers.container import LostMessage, RawMessage
+from recordings.containers.container import LostMessage
 from recordings.containers.finding import first_bytes
 from recordings.containers.timeline import MAX_LOG_TIME
 from recordings.errors import LogError, sentence_of
@@ -37,45 +38,61 @@ RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _FOOTER_LENGTH = 20
 _MAX_SUMMARY_BYTES = 1 << 30  # of a summary or header that is read
+_MAX_SECTION_BYTES = 1 << 28  # of the message index of a chunk
 _UNCHECKED_BYTES = 1 << 16  # that are asked for without a look at the file's size, for speed
 _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
+
+
+class StoredChunk(NamedTuple):
+    """Where messages are.
+
+    offset, length: of the chunk record, bytes; places: of its messages in the timeline; index_length: of the message
+    index after it, bytes; is_cut: its end is missing; is_bare: messages outside chunks.
+    """
+
+    offset: int
+    length: int
+    places: range
+    index_length: int = 0
+    is_cut: bool = False
+    is_bare: bool = False
 
 
 @dataclass
 class Index:
     """The index of a file.
 
-    chunks: each with its channels (none listed: unknown); unchunked: the place, the offset and the size of the data,
-    bytes, of the messages outside chunks; rescued: messages of a cut chunk, each with its place; lost: the damage
-    found; stated_counts: messages by channel, stated_records: number of chunks, channels and schemas, both
-    from the file's statistics. Of the messages counted so far, all with `walked`: counted_channels and counted_times:
-    in file order; places: chunk offset -> the places of its messages; latest: the last log time, ns.
+    chunks: in file order; message_channels, message_times: of every message, in file order; lost: the damage found;
+    stated_counts: messages by channel, by the file's statistics; unpacked: bytes of all chunks; latest: the last log
+    time so far, ns.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
-    chunks: list[ChunkIndex] = field(default_factory=list)
-    unchunked: tuple[array[int], array[int], array[int]] = field(
-        default_factory=lambda: (array("I"), array("Q"), array("I"))
-    )
-    rescued: list[tuple[int, RawMessage]] = field(default_factory=list)
+    chunks: list[StoredChunk] = field(default_factory=list)
+    message_channels: array[int] = field(default_factory=lambda: array("H"))
+    message_times: array[int] = field(default_factory=lambda: array("Q"))
     lost: list[LostMessage] = field(default_factory=list)
-    counted_channels: array[int] = field(default_factory=lambda: array("H"))
-    counted_times: array[int] = field(default_factory=lambda: array("Q"))
-    places: dict[int, range] = field(default_factory=dict)
     stated_counts: dict[int, int] = field(default_factory=dict)
-    stated_records: tuple[int, int, int] | None = None
     profile: str = ""
     walked: bool = False
+    unpacked: int = 0
     latest: int = 0
 
-    def count_message(self, channel: int, log_time: int) -> int:
-        """Count the next message of the file; returns its place."""
-        self.counted_channels.append(channel)
-        self.counted_times.append(log_time)
-        if log_time <= MAX_LOG_TIME:
-            self.latest = max(self.latest, log_time)
-        return len(self.counted_times) - 1
+    def add(
+        self,
+        offset: int,
+        length: int,
+        channels: array[int] | NDArray[Any],
+        times: array[int] | NDArray[Any],
+        **kind: Any,
+    ) -> None:
+        """Add the next messages of the file, in a chunk or outside; kind: fields of `StoredChunk`."""
+        first, times = len(self.message_times), np.asarray(times, np.uint64)
+        self.message_channels.frombytes(channels.tobytes())
+        self.message_times.frombytes(times.tobytes())
+        self.latest = max(self.latest, int(np.max(times[times <= MAX_LOG_TIME], initial=0)))
+        self.chunks.append(StoredChunk(offset, length, range(first, len(self.message_times)), **kind))
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Store a schema or a channel; other records are ignored."""
@@ -90,7 +107,12 @@ class Index:
 
     def note_damage(self, reason: str, log_time: int | None = None) -> None:
         """Note damage whose messages are unknown. Without a log time it is placed after all messages so far."""
-        self.lost.append(LostMessage(None, self.latest if log_time is None else log_time, reason))
+        self.lost.append(LostMessage(None, self.latest if log_time is None else min(log_time, MAX_LOG_TIME), reason))
+
+    def counts(self) -> dict[int, int]:
+        """The number of messages by channel."""
+        counts = np.bincount(np.asarray(self.message_channels, np.uint16))
+        return {int(number): int(counts[number]) for number in np.flatnonzero(counts)}
 
 
 def _check_read(record: Schema | Channel, content: bytes | memoryview) -> None:
@@ -111,19 +133,28 @@ def opened(path: Path) -> BinaryIO:
 
 
 def index_from_summary(file: BinaryIO, size: int) -> Index | None:
-    """The index in the file's summary; None unless it surely describes the whole file."""
-    index = read_summary(file, size)
-    if index is None or index.stated_records is None:
+    """The index by the file's summary and message indexes; None unless it surely describes the whole file."""
+    summary = read_summary(file, size)
+    if summary is None:
         return None
-    chunks, channels, schemas = index.stated_records
+    index, chunks, statistics = summary
     whole = (
-        chunks == len(index.chunks) > 0
-        and index.stated_counts  # statistics may leave these counts out
-        and channels == len(index.channels)
-        and schemas == len(index.schemas)
-        and all(chunk.message_index_offsets.keys() <= index.channels.keys() for chunk in index.chunks)
+        statistics is not None
+        and statistics.chunk_count == len(chunks) > 0
+        and statistics.channel_count == len(index.channels)
+        and statistics.schema_count == len(index.schemas)
     )
     if not whole:
+        return None
+    for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
+        stored = StoredChunk(chunk.chunk_start_offset, chunk.chunk_length, range(0), chunk.message_index_length)
+        channels, times, _ = message_index(file, stored)
+        index.add(stored.offset, stored.length, channels, times, index_length=stored.index_length)
+        index.unpacked += chunk.uncompressed_size
+    stated = {channel: count for channel, count in index.stated_counts.items() if count}
+    if not stated or index.counts() != stated or not stated.keys() <= index.channels.keys():
+        return None
+    if max(index.message_times) > MAX_LOG_TIME:
         return None
     with suppress(*PARSE_ERRORS):  # a log without its header can still be read
         _, length = RECORD.unpack(read_at(file, len(MAGIC), RECORD.size))
@@ -131,13 +162,30 @@ def index_from_summary(file: BinaryIO, size: int) -> Index | None:
     return index
 
 
+def message_index(
+    file: BinaryIO, chunk: StoredChunk
+) -> tuple[NDArray[np.uint16], NDArray[np.uint64], NDArray[np.uint64]]:
+    """Channel, log time and offset of each message of a chunk, in file order; empty without a message index."""
+    channels, entries = [np.zeros(0, np.uint16)], [np.zeros((0, 2), np.uint64)]
+    section = read_at(file, chunk.offset + chunk.length, min(chunk.index_length, _MAX_SECTION_BYTES))
+    with suppress(*PARSE_ERRORS):
+        for opcode, content in iter_records(section):
+            if opcode == Opcode.MESSAGE_INDEX:
+                channel, size = struct.unpack_from("<HI", content)
+                entries.append(np.frombuffer(content, "<u8", size // 16 * 2, 6).reshape(-1, 2))
+                channels.append(np.full(len(entries[-1]), channel, np.uint16))
+    times, offsets = np.concatenate(entries).T
+    order = np.argsort(offsets, kind="stable")
+    return np.concatenate(channels)[order], times[order], offsets[order]
+
+
 def profile_of(content: bytes) -> str:
     """The profile in a header record."""
     return str(Header.read(_stream(content)).profile)
 
 
-def read_summary(file: BinaryIO, size: int) -> Index | None:
-    """The content of the summary section; None if there is none or its CRC does not match."""
+def read_summary(file: BinaryIO, size: int) -> tuple[Index, list[ChunkIndex], Statistics | None] | None:
+    """The summary section, its definitions in an index; None if it is not there or its CRC does not match."""
     if size < len(MAGIC) + _TAIL:
         return None
     tail = read_at(file, size - _TAIL, _TAIL)
@@ -152,20 +200,19 @@ def read_summary(file: BinaryIO, size: int) -> Index | None:
     section = read_at(file, footer.summary_start, length)
     if footer.summary_crc and crc32(tail[: RECORD.size + 16], crc32(section)) != footer.summary_crc:
         return None
-    index = Index()
+    index, chunks, statistics = Index(), list[ChunkIndex](), None
     try:
         for opcode, content in iter_records(section):
             if opcode == Opcode.CHUNK_INDEX:
-                index.chunks.append(ChunkIndex.read(_stream(content)))
+                chunks.append(ChunkIndex.read(_stream(content)))
             elif opcode == Opcode.STATISTICS:
                 statistics = Statistics.read(_stream(content))
-                index.stated_records = statistics.chunk_count, statistics.channel_count, statistics.schema_count
                 index.stated_counts = dict(statistics.channel_message_counts)
             else:
                 index.define(opcode, content)
     except PARSE_ERRORS:
         return None
-    return index
+    return index, chunks, statistics
 
 
 def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
@@ -179,24 +226,18 @@ def read_at(file: BinaryIO, offset: int, size: int) -> bytes:
     return found
 
 
-def iter_records(section: bytes | memoryview, whole: bool = True) -> Iterator[tuple[int, memoryview]]:
-    """(opcode, content) of each record of a section. A cut record raises ValueError; without `whole` it is left out."""
+def iter_records(section: bytes | memoryview, is_cut: bool = False) -> Iterator[tuple[int, memoryview]]:
+    """(opcode, content) of each record of a section. A cut record raises ValueError, or is left out if `is_cut`."""
     view, position = memoryview(section), 0
     while position < len(view):
         after = position + RECORD.size
         length = RECORD.unpack_from(view, position)[1] if after <= len(view) else len(view)
         if after + length > len(view):
-            if whole:
-                raise ValueError("a record is longer than its section")
-            return
+            if is_cut:
+                return
+            raise ValueError("a record is longer than its section")
         yield view[position], view[after : after + length]
         position = after + length
-
-
-def parse_message(content: memoryview) -> RawMessage:
-    """The message in a message record."""
-    channel, _, log_time, _ = MESSAGE.unpack_from(content)
-    return RawMessage(channel, log_time, content[MESSAGE.size :])
 
 
 def lost_chunk(offset: int, error: Exception) -> str:

@@ -9,7 +9,7 @@ import fcntl
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
-from itertools import groupby
+from itertools import groupby, takewhile
 from operator import attrgetter
 from os.path import samestat
 from pathlib import Path
@@ -41,11 +41,12 @@ class ResumableWriter(Ros2Writer):
         self._stamp, self._copies = -1, dict[str, RawMessage]()
         with suppress(LogError):
             log = self._opened.enter_context(McapFile(self._before))
-            log.index.rescued.clear()  # no CRC covers these messages
             topics = {channel.topic: log.channels_of([channel.topic]) for channel in log.channels.values()}
             self.contained = {topic: set(log.times(channels).tolist()) for topic, channels in topics.items()}
             self._channels_before = log.channels
-            self._groups = groupby(log.messages(set(log.channels)), attrgetter("log_time"))
+            checked = [chunk.places.stop for chunk in takewhile(lambda chunk: not chunk.is_cut, log.index.chunks)]
+            checked_messages = log.messages(set(log.channels), places=range(max(checked, default=0)))
+            self._groups = groupby(checked_messages, attrgetter("log_time"))
 
     def skip(self, topic: str, stamp: int) -> bool:
         """Copy a message of the unfinished log; False if it is not there. The stamps must ascend."""

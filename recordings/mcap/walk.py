@@ -8,18 +8,18 @@ loss is noted.
 from __future__ import annotations
 
 import struct
-from contextlib import suppress
+from array import array
 from typing import BinaryIO
 
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex
 
 from flow.contracts import counted
 from recordings.errors import sentence_of
 from recordings.mcap.chunk import (
     CHUNK_HEAD_BYTES,
     MAX_CHUNK_BYTES,
+    ChunkTable,
     chunk_start_time,
     find_chunk,
     is_chunk,
@@ -34,12 +34,10 @@ from recordings.mcap.index import (
     Index,
     iter_records,
     lost_chunk,
-    parse_message,
     profile_of,
     read_at,
     read_summary,
 )
-from recordings.mcap.message_order import ChunkTable
 
 _MIN_PRIVATE_OPCODE = 0x80
 _MAX_READ_BYTES = {Opcode.CHUNK: MAX_CHUNK_BYTES, Opcode.MESSAGE: MESSAGE.size, Opcode.ATTACHMENT: 0}  # of a record
@@ -50,8 +48,8 @@ _BLOCK_BYTES = 1 << 20
 
 def walk(file: BinaryIO, size: int) -> Index:
     """Build the index of a file from its data section."""
-    own = read_summary(file, size) or Index()  # its definitions may be lost in the data section
-    index = Index(own.schemas, own.channels, stated_counts=own.stated_counts, walked=True)
+    index, *_ = read_summary(file, size) or (Index(),)  # its definitions may be lost in the data section
+    index.walked = True
     position, before = len(MAGIC), 0
     checksum: int | None = crc32(MAGIC)  # None: bytes were skipped
     while True:
@@ -102,7 +100,8 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
     if opcode == Opcode.CHUNK:
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
-        _note_message(index, content, position, length)
+        channel, _, log_time, _ = MESSAGE.unpack_from(content)
+        index.add(position, RECORD.size + length, array("H", [channel]), array("Q", [log_time]), is_bare=True)
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -117,47 +116,31 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
 
 def _note_messages(index: Index, block: bytes, position: int) -> int:
     """Note the messages at the start of a block; returns the length of their records."""
-    at, shortest = 0, RECORD.size + MESSAGE.size
-    while at + shortest <= len(block):
-        opcode, length = RECORD.unpack_from(block, at)
-        end = at + RECORD.size + length
-        if opcode != Opcode.MESSAGE or length < MESSAGE.size or end > len(block):
+    taken = 0
+    for opcode, content in iter_records(block, is_cut=True):
+        if opcode != Opcode.MESSAGE or len(content) < MESSAGE.size:
             break
-        _note_message(index, block, position + at, length, at + RECORD.size)
-        at = end
-    return at
+        taken += RECORD.size + len(content)
+    if taken:
+        table = ChunkTable(block[:taken])
+        index.add(position, taken, table.channels, table.times, is_bare=True)
+    return taken
 
 
-def _note_message(index: Index, content: bytes, position: int, length: int, start: int = 0) -> None:
-    """Note a message outside chunks. position: of its record in the file; start: of the record's content."""
-    channel, _, log_time, _ = MESSAGE.unpack_from(content, start)
-    places, offsets, sizes = index.unchunked
-    places.append(index.count_message(channel, log_time))
-    offsets.append(position + RECORD.size + MESSAGE.size)
-    sizes.append(length - MESSAGE.size)
-
-
-def _note_chunk(index: Index, content: bytes, position: int) -> None:
+def _note_chunk(index: Index, content: bytes, position: int, is_cut: bool = False) -> None:
+    """Note the messages of a chunk."""
     try:
-        records = unpack_chunk(content)
-        table = ChunkTable(records)  # a chunk with a cut record is broken as a whole
+        records = unpack_cut_chunk(content) if is_cut else unpack_chunk(content)
+        table = ChunkTable(records, is_cut)  # a whole chunk with a cut record is broken
     except PARSE_ERRORS as error:
-        index.note_damage(lost_chunk(position, error), chunk_start_time(content))
+        if not is_cut:  # else nothing more can be rescued
+            index.note_damage(lost_chunk(position, error), chunk_start_time(content))
         return
-    for opcode, record in iter_records(records):
+    for opcode, record in iter_records(records, is_cut):
         index.define(opcode, record)
     if table.times:
-        first = len(index.counted_times)
-        for channel, log_time in zip(table.channels, table.times, strict=True):
-            index.count_message(channel, log_time)
-        chunk = ChunkIndex(
-            chunk_length=RECORD.size + len(content), chunk_start_offset=position, compression="", compressed_size=0,
-            message_end_time=max(table.times), message_index_length=0,
-            message_index_offsets=dict.fromkeys(table.channels, 0), message_start_time=min(table.times),
-            uncompressed_size=len(records),
-        )  # fmt: skip
-        index.chunks.append(chunk)
-        index.places[position] = range(first, len(index.counted_times))
+        index.add(position, RECORD.size + len(content), table.channels, table.times, is_cut=is_cut)
+        index.unpacked += len(records)
 
 
 def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:
@@ -181,15 +164,9 @@ def _note_damage(index: Index, file: BinaryIO, position: int, found: int | None,
     is_cut = is_chunk(read_at(file, position, CHUNK_HEAD_BYTES))
     record = read_at(file, position, min(end - position, MAX_CHUNK_BYTES if is_cut else _MAX_RESCUE_BYTES))
     if record[:1] == bytes([Opcode.CHUNK]):
-        with suppress(*PARSE_ERRORS):  # nothing more can be rescued then
-            for opcode, content in iter_records(unpack_cut_chunk(record[RECORD.size :]), whole=False):
-                if opcode == Opcode.MESSAGE:
-                    message = parse_message(content)
-                    index.rescued.append((index.count_message(message.channel, message.log_time), message))
-                else:
-                    index.define(opcode, content)
+        _note_chunk(index, record[RECORD.size :], position, is_cut=True)
     if found is None:
-        held = counted(len(index.counted_times), "message")
+        held = counted(len(index.message_times), "message")
         index.note_damage(f"the log is truncated or damaged at byte {position} of {size}; intact before it: {held}")
     else:
         index.note_damage(f"the log is damaged from byte {position} to byte {found}; messages there may be lost")

@@ -11,11 +11,11 @@ from mcap.writer import CompressionType
 
 from flow.contracts import Severity
 from recordings import McapSource
+from recordings.containers.container import HEAD_BYTES
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
 from recordings.inventory.description import Damage, describe
 from recordings.inventory.text import format_description
-from recordings.mcap.chunk import HEAD_BYTES
 from recordings.mcap.file import McapFile
 from stages.data import Transform
 from tests.conftest import rewrite

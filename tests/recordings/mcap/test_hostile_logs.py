@@ -17,8 +17,9 @@ from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 
 from recordings import McapSource
+from recordings.containers import container
 from recordings.errors import LogError
-from recordings.mcap import chunk, message_order
+from recordings.mcap import chunk
 from recordings.mcap.file import McapFile
 from tests.conftest import Extra, rewrite
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
@@ -266,9 +267,10 @@ def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tm
     shuffled = rewrite(
         sample, tmp_path / "log.mcap", order=lambda rows: rows[::3] + rows[1::3] + rows[2::3], chunk_size=3000
     )
+    monkeypatch.setattr("recordings.mcap.file._RECENT_BYTES", 0)
     counts = []
-    for limit in (1 << 28, 1):
-        monkeypatch.setattr(message_order, "MAX_OPEN_BYTES", limit)
+    for limit in (1 << 27, 1):
+        monkeypatch.setattr(container, "MAX_OPEN_BYTES", limit)
         unpacked.clear()
         assert essences(items_of(shuffled)) == essences(whole)
         counts.append(len(unpacked))
