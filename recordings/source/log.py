@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flow.contracts import Finding, Severity
 from recordings.containers.clock import MAX_JITTER_NS
@@ -61,7 +60,6 @@ class McapLog:
     topics: Mapping[str, str] = field(init=False)
     _estimator: UpEstimator | None = field(init=False, default=None)  # the last one
     _moving: MovingMount | None = field(init=False, default=None)  # the last one
-    _info_times: dict[str, NDArray[np.int64]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         self.file = open_recording(self.given)
@@ -143,11 +141,11 @@ class McapLog:
             if part.has(0, log_time):
                 yield log_time, "inclinometer", item
 
-    def _samples(self, readers: dict[int, TopicReader], part: TimeRange) -> Iterator[Sampled]:
+    def _samples(self, readers: dict[int, list[TopicReader]], part: TimeRange) -> Iterator[Sampled]:
         """What these readers read, without lost messages, which `_read` reports."""
         for raw in self.file.messages(set(readers), part.low, part.high):
             if isinstance(raw, RawMessage):
-                yield raw.log_time, readers[raw.channel](raw)
+                yield from ((raw.log_time, reader(raw)) for reader in readers[raw.channel])
 
     def _read(
         self, part: TimeRange, frames: FramesInRange, streams: Collection[str], ahead: int
@@ -163,79 +161,71 @@ class McapLog:
         if self.resolution.mount is not None and "mount" in streams and moving is None:
             yield log_start, "mount", self.resolution.mount
         calibrations = {side: CalibrationHistory(info.model) for side, info in self.resolution.infos.items()}
-        readers = self._readers.of_calibrations(calibrations, streams)
+        early = self._readers.of_calibrations(calibrations, streams)
+        later = self._readers.of_streams(calibrations, streams)
         if log_start > self.file.start:
-            for reader in readers:
-                self._note_last_before(log_start, reader)
-        infos, given = by_channel(readers), self._readers.of_streams(calibrations, streams)
-        items = by_channel(given)
-        # An Odometry may be the pose and the tilt.
-        twins = {channel: each for each in given for channel in each.decoders if items[channel] is not each}
+            for infos in early:  # the calibration in force is the last readable one before
+                next((raw for raw in self._back_from(log_start, infos) if infos(raw) is None), None)
         if moving is not None:
-            infos |= by_channel(self._readers.of_transforms(moving, items))
+            early += self._readers.of_transforms(moving)
+        videos = [reader for reader in later if reader.video is not None]
         if wide.low is not None:
-            for reader in items.values():
-                self._begin_video(wide.low, reader)
+            for video in videos:
+                self._begin_video(wide.low, video)
+        infos_of, readers_of = by_channel(early), by_channel(later)
         lag = MAX_CALIBRATION_LAG_NS if moving is None else MAX_TRANSFORM_LAG_NS
-        raws = self.file.messages(infos.keys() | items.keys(), wide.low, wide.high)
-        for raw, noted in with_lookahead(raws, infos, lag):
+        raws = self.file.messages(infos_of.keys() | readers_of.keys(), wide.low, wide.high)
+        for raw, found in with_lookahead(raws, infos_of, lag):
+            channel = -1 if raw.channel is None else raw.channel
             if isinstance(raw, LostMessage):
-                for reader in items.values():
-                    reader.note_lost(raw.channel)
-                if not near.has(0, raw.log_time):
+                for video in videos:
+                    video.note_lost(raw.channel)
+                if near.has(0, raw.log_time):
+                    yield self._loss(raw, [*readers_of.get(channel, []), *infos_of.get(channel, [])])
+                continue
+            for reader in readers_of.get(channel, []):
+                # Later images of a video need those before.
+                if reader.video is not None or self._is_inside(raw, reader.stream, part, near, frames):
+                    found.append((reader.stream, reader(raw)))
+            for stream, item in found:
+                if item is None or not self._is_inside(raw, stream, part, near, frames):
                     continue
-            if raw.channel is None:
-                yield raw.log_time, "log", LogError(f"{self.path.name}: {raw.reason}")
-                continue
-            reader = (infos if raw.channel in infos else items)[raw.channel]
-            if isinstance(raw, LostMessage):
-                yield raw.log_time, reader.stream, LogError(f"{reader.topic}: {raw.reason}")
-                continue
-            is_inside = not part.edges or (
-                frames.has(reader.stream, self.stamp_of(raw, reader.stream), raw.log_time)
-                if reader.stream in CAMERAS
-                else near.has(self.stamp_of(raw, reader.stream), raw.log_time)
-            )
-            if not is_inside:
-                if reader.video is not None:  # later images need it
-                    reader(raw)
-                continue
-            item = noted if raw.channel in infos else reader(raw)
-            if moving is not None and reader.stream == "left" and isinstance(item, CameraImage):
-                mount = attempt(moving.at, item.stamp)
-                if isinstance(mount, Mount):
-                    yield raw.log_time, "mount", mount
-                else:
-                    item = mount
-            if item is not None:
-                yield raw.log_time, reader.stream, item
-            if (twin := twins.get(raw.channel)) and (other := twin(raw)) is not None:
-                yield raw.log_time, twin.stream, other
+                if moving is not None and stream == "left" and isinstance(item, CameraImage):
+                    mount = attempt(moving.at, item.stamp)
+                    if isinstance(mount, Mount):
+                        yield raw.log_time, "mount", mount
+                    else:
+                        item = mount
+                yield raw.log_time, stream, item
 
-    def _note_last_before(self, log_time: int, infos: TopicReader) -> None:
-        """Add the calibration in force at `log_time`: the last readable one before it."""
-        channels = set(infos.decoders)
-        if infos.topic not in self._info_times:
-            self._info_times[infos.topic] = self.file.times(channels)
-        times = self._info_times[infos.topic]
-        for time in reversed(times[times < log_time].tolist()):
-            raws = self.file.messages(channels, time, time + 1)
-            if any(raw.channel in channels and isinstance(raw, RawMessage) and infos(raw) is None for raw in raws):
-                return
+    def _loss(self, lost: LostMessage, readers: Sequence[TopicReader]) -> tuple[int, str, LogError]:
+        """The event of a lost message."""
+        if not readers:
+            return lost.log_time, "log", LogError(f"{self.path.name}: {lost.reason}")
+        return lost.log_time, readers[-1].stream, LogError(f"{readers[-1].topic}: {lost.reason}")
+
+    def _is_inside(self, raw: RawMessage, stream: str, part: TimeRange, near: TimeRange, frames: FramesInRange) -> bool:
+        """Whether a message belongs to a part, or, of other streams than the images, to its surroundings."""
+        if not part.edges:
+            return True
+        stamp = self.stamp_of(raw, stream)
+        return frames.has(stream, stamp, raw.log_time) if stream in CAMERAS else near.has(stamp, raw.log_time)
+
+    def _back_from(self, log_time: int, reader: TopicReader, most: int | None = None) -> Iterator[RawMessage]:
+        """The messages of a reader before `log_time`, the last first, of at most `most` log times."""
+        channels = set(reader.decoders)
+        times = self.file.times(channels)
+        for time in times[times < log_time][::-1][:most].tolist():
+            yield from (raw for raw in self.file.messages(channels, time, time + 1) if isinstance(raw, RawMessage))
 
     def _begin_video(self, log_time: int, reader: TopicReader) -> None:
         """Decode a video from the last key frame before `log_time`."""
-        channels, video = set(reader.decoders), reader.video
-        times = self.file.times(channels) if video is not None else np.zeros(0, np.int64)
-        for time in reversed(times[times < log_time][-_MAX_KEY_INTERVAL:].tolist()):
-            raws = self.file.messages(channels, time, time + 1)
-            if any(isinstance(raw, RawMessage) and reader.begins_video(raw) for raw in raws):
-                for raw in self.file.messages(channels, time, log_time):
-                    if isinstance(raw, RawMessage):
-                        reader(raw)
-                    else:
-                        reader.note_lost(raw.channel)
-                return
+        key = next(filter(reader.begins_video, self._back_from(log_time, reader, _MAX_KEY_INTERVAL)), None)
+        for raw in self.file.messages(set(reader.decoders), key.log_time, log_time) if key is not None else ():
+            if isinstance(raw, RawMessage):
+                reader(raw)
+            else:
+                reader.note_lost(raw.channel)
 
     def notes(self) -> dict[str, str]:
         """Stream -> note: missing stamps, the source of the baseline, an unknown base frame."""

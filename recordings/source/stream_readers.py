@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -76,14 +77,9 @@ class StreamReaders:
         samplers = self.resolution.tilt.samplers(self.source) if self.resolution.tilt is not None else {}
         return [self._reader("inclinometer", topic, sample) for topic, sample in samplers.items()]
 
-    def of_transforms(self, moving: MovingMount, items: Mapping[int, TopicReader]) -> Iterator[TopicReader]:
-        """Those of the transforms that move the camera; the topic may also be that of the pose."""
-        for topic in moving.topics:
-            pose = next((reader for reader in items.values() if reader.topic == topic), None)
-            if pose is None:
-                yield self._reader("mount", topic, moving.add)
-            else:
-                yield replace(pose, item=partial(_both, moving.add, pose.item))
+    def of_transforms(self, moving: MovingMount) -> list[TopicReader]:
+        """Those of the transforms that move the camera."""
+        return [self._reader("mount", topic, moving.add) for topic in moving.topics]
 
     def _rover_pose(self, pose: Pose | None) -> Pose | None:
         cameras = self.resolution.cameras
@@ -99,9 +95,13 @@ class StreamReaders:
         return TopicReader(stream, topic, decoders, made, pixels_of if isinstance(pixels_of, VideoDecoder) else None)
 
 
-def by_channel(readers: Iterable[TopicReader]) -> dict[int, TopicReader]:
-    """Number of a channel -> its reader; of several readers of one topic, the last."""
-    return {channel: reader for reader in readers for channel in reader.decoders}
+def by_channel(readers: Iterable[TopicReader]) -> dict[int, list[TopicReader]]:
+    """Number of a channel -> its readers: an Odometry may be the pose and the tilt."""
+    found = defaultdict[int, list[TopicReader]](list)
+    for reader in readers:
+        for channel in reader.decoders:
+            found[channel].append(reader)
+    return dict(found)
 
 
 def _nothing(message: Any, log_time: int) -> None:
@@ -111,8 +111,3 @@ def _nothing(message: Any, log_time: int) -> None:
 def _by_stamp_alone(item: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
     """The same for stamps of another clock than the log times: a stamp of 0 is one."""
     return lambda message, log_time: item(message, 0)
-
-
-def _both(first: Callable[[Any, int], Any], then: Callable[[Any, int], Any], message: Any, log_time: int) -> Any:
-    first(message, log_time)
-    return then(message, log_time)

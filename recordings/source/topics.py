@@ -199,14 +199,15 @@ def attempt(make: Callable[..., T], *arguments: Any) -> T | LogError:
 
 
 def with_lookahead(
-    raws: Iterable[RawMessage | LostMessage], early: dict[int, TopicReader], lag: int
-) -> Iterator[tuple[RawMessage | LostMessage, Any]]:
-    """Each message with the result of its reader in `early`, which reads `lag` ns ahead."""
-    waiting: deque[tuple[RawMessage | LostMessage, Any]] = deque()
+    raws: Iterable[RawMessage | LostMessage], early: dict[int, list[TopicReader]], lag: int
+) -> Iterator[tuple[RawMessage | LostMessage, list[tuple[str, Any]]]]:
+    """Each message with the streams and results of its readers in `early`, which read `lag` ns ahead."""
+    waiting: deque[tuple[RawMessage | LostMessage, list[tuple[str, Any]]]] = deque()
     size = 0
     for raw in raws:
         size += _size(raw)
-        waiting.append((raw, early[raw.channel](raw) if isinstance(raw, RawMessage) and raw.channel in early else None))
+        made = [(each.stream, each(raw)) for each in early.get(raw.channel, ())] if isinstance(raw, RawMessage) else []
+        waiting.append((raw, made))
         while waiting[0][0].log_time < raw.log_time - lag or (size > _MAX_WAITING_BYTES and len(waiting) > 1):
             size -= _size(waiting[0][0])
             yield waiting.popleft()
