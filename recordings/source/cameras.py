@@ -49,18 +49,12 @@ class CalibrationHistory:
 
     def check(self, stamp: int) -> None:
         """Raise LogError if the calibration at `stamp` is not the first one."""
-        place = bisect_right(self.stamps, stamp) - 1
-        if place >= 0 and not self.same[place]:
+        place = bisect_right(self.stamps, stamp)
+        if place and not self.same[place - 1]:
             raise LogError(
                 "the calibration differs from the log's first one, so the image cannot be used; record two cameras on "
-                f"two topics, or split the log where it changes ({self._since(place)})"
+                "two topics, or split the log where it changes"
             )
-
-    def _since(self, place: int) -> str:
-        """The stamp from which the calibration at `place` differs."""
-        while place > 0 and not self.same[place - 1]:
-            place -= 1
-        return f"{'' if place else 'at or before '}{self.stamps[place]} ns"
 
 
 @dataclass(frozen=True)

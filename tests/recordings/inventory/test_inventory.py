@@ -127,7 +127,7 @@ def test_images_of_a_second_camera_on_a_topic_are_not_usable(tmp_path, monkeypat
     (damage,) = described["damage"]
     why = "the calibration differs from the log's first one, so the image cannot be used"
     remedy = "record two cameras on two topics, or split the log where it changes"
-    assert damage.startswith(f"2 similar, first: {LEFT} at {START + PERIOD} ns: {why}; {remedy} (")
+    assert damage.startswith(f"2 similar, first: {LEFT} at {START + PERIOD} ns: {why}; {remedy}")
 
 
 def test_without_cameras_no_pairs_are_reported(tmp_path):

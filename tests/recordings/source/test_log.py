@@ -40,7 +40,7 @@ def test_an_image_under_another_calibration_is_lost(tmp_path, lag):
     assert [(time, stream) for time, stream, _ in lost] == [
         (START + number * PERIOD + IMAGE_LAG, "left") for number in (2, 3)
     ]
-    assert all(f"split the log where it changes ({START + 2 * PERIOD} ns)" in sentence for _, _, sentence in lost)
+    assert all("split the log where it changes" in sentence for _, _, sentence in lost)
     left = [item.stamp for _, stream, item in events if stream == "left" and not isinstance(item, Exception)]
     assert left == [START + number * PERIOD for number in (0, 1, 4)]
     assert sum(stream == "right" for _, stream, _ in events) == FRAMES
@@ -82,11 +82,8 @@ def test_a_calibration_change_before_the_range_is_known(tmp_path, layout):
     with McapSource().open(path, start=7.5) as log:
         read, lost = left_of(log.events())
         assert (read, len(lost)) == ([], 1)
-        assert f"where it changes (at or before {START + 2 * PERIOD} ns)" in lost[0]
         excerpts = [left_of(events)[0] for events in log.excerpts(FRAMES, {"left", "right"})]
     assert excerpts == [[0, 1], [1], [], [], []]
-    with McapSource().open(path, start=3) as log:
-        assert f"where it changes ({START + 2 * PERIOD} ns)" in left_of(log.events())[1][0]
 
 
 def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path):
@@ -96,7 +93,8 @@ def test_a_damaged_calibration_keeps_the_previous_one_in_force(tmp_path):
     assert broken.message_start_time >= START + 60 * PERIOD
     with McapSource().open(with_broken(path, broken), start=8.0) as log:
         read, lost = left_of(log.events())
-        assert (read, lost[-1].rpartition("(")[2]) == ([], f"at or before {START + 2 * PERIOD} ns)")
+        assert (read, len(lost)) == ([], 1)
+        assert lost[-1].endswith("split the log where it changes")
 
 
 def test_a_tilt_of_another_sensor_is_lost(tmp_path):
