@@ -26,24 +26,17 @@ from recordings.containers.timeline import Places, Timeline
 _MAX_REMEMBERED = 32  # messages of a topic, to leave out those that were recorded twice
 
 
-@dataclass(frozen=True)
-class _Numbers:
-    """The numbers of a file's channels. merged: number in the file -> number in the recording."""
-
-    merged: Mapping[int, int]
-
-    @cached_property
-    def _own(self) -> dict[int, int]:
-        return {number: own for own, number in self.merged.items()}
-
-    def of_file(self, channels: set[int]) -> set[int]:
-        """The file's numbers of some channels of the recording."""
-        return {self._own[channel] for channel in channels if channel in self._own}
+Numbers = Mapping[int, int]  # number of a channel in a file -> number in the recording
 
 
-def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], list[_Numbers]]:
+def _of_file(numbers: Numbers, channels: set[int]) -> set[int]:
+    """The file's numbers of some channels of the recording."""
+    return {own for own, number in numbers.items() if number in channels}
+
+
+def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], list[Numbers]]:
     """The channels of all files, and their numbers in each. Equal channels of several files are one."""
-    merged, numbers, known = dict[int, Channel](), list[_Numbers](), dict[Any, list[int]]()
+    merged, numbers, known = dict[int, Channel](), list[Numbers](), dict[Any, list[int]]()
     for file in files:
         own, taken = dict[int, int](), set[int]()
         for number, channel in file.channels.items():
@@ -55,7 +48,7 @@ def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], li
                 same.append(free)
             own[number] = free
             taken.add(free)
-        numbers.append(_Numbers(own))
+        numbers.append(own)
     return merged, numbers
 
 
@@ -64,7 +57,7 @@ class _Part:
     """A stretch of a file between two steps of the recorder's clock. places: in the file."""
 
     file: Container
-    numbers: _Numbers
+    numbers: Numbers
     places: range
     step: ClockStep
 
@@ -84,7 +77,7 @@ class _Part:
     def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
         """The log times of some channels of the recording, ns, in any order."""
         known = self.file.timeline.by_channel
-        inside = (self._inside(known[channel]) for channel in self.numbers.of_file(channels) & known.keys())
+        inside = (self._inside(known[channel]) for channel in _of_file(self.numbers, channels) & known.keys())
         times = np.concatenate([np.zeros(0, np.int64), *(self.file.timeline.log_times[places] for places in inside)])
         if self.step.repeats_until and not allow_repeats:
             times = times[times >= self.step.repeats_until]
@@ -100,10 +93,10 @@ class _Part:
         self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of some channels of the recording, in log-time order."""
-        own = self.numbers.of_file(channels)
+        own = _of_file(self.numbers, channels)
         low, high = (None if time is None else max(time - self.step.shift, 0) for time in (start, end))
         for item in self.file.messages(own, low, high, None if self.whole else self.places):
-            channel = None if item.channel is None else self.numbers.merged[item.channel]
+            channel = None if item.channel is None else self.numbers[item.channel]
             log_time = item.log_time + self.step.shift
             if isinstance(item, LostMessage):
                 yield LostMessage(channel, log_time, item.reason)
@@ -235,9 +228,9 @@ class Recording:
             yield from self.messages(channels)
             return
         for file, numbers in zip(self.files, self._numbers, strict=True):
-            own = numbers.of_file(channels)
+            own = _of_file(numbers, channels)
             for item in file.heads(own) if own else ():
-                yield item if item.channel is None else item._replace(channel=numbers.merged[item.channel])
+                yield item if item.channel is None else item._replace(channel=numbers[item.channel])
 
     def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns; by default without those that repeat."""
@@ -248,7 +241,7 @@ class Recording:
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
         found = zip(self.files, self._numbers, strict=True)
-        return sum(file.count(numbers.of_file(channels)) for file, numbers in found)
+        return sum(file.count(_of_file(numbers, channels)) for file, numbers in found)
 
     def close(self) -> None:
         """Close the files."""
@@ -298,7 +291,7 @@ class Recording:
         channels = list[NDArray[np.int32]]()
         for numbers, timeline in zip(self._numbers, timelines, strict=True):
             merged_of = np.full(np.max(timeline.channels, initial=0) + 1, -1, np.int32)  # -1: of no known channel
-            for own, number in numbers.merged.items():
+            for own, number in numbers.items():
                 merged_of[own : own + 1] = number
             channels.append(merged_of[timeline.channels])
         merged = Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
