@@ -6,22 +6,19 @@ frame, where the axis is (xyz, m), how it is turned (rpy, rad), and its directio
 
 from __future__ import annotations
 
-import reprlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from recordings.calibration.yaml_files import read_yaml
+from recordings.calibration.yaml_files import numbers, read_yaml
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name
 from stages.data import Array, Transform
 from stages.data.rotations import turn_by
 
 _VECTORS = {"xyz": (0.0, 0.0, 0.0), "rpy": (0.0, 0.0, 0.0), "axis": (1.0, 0.0, 0.0)}  # as URDF has them by default
-_MAX_NUMBER = 1e6  # m or rad
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +59,10 @@ def _joint(where: str, entry: Any) -> Joint:
     for name in ("parent", "child"):
         if not isinstance(entry.get(name), str) or not entry[name]:
             raise LogError(f"{where} needs the name of its frame '{name}'")
-    vectors = {name: _vector(where, name, entry) for name in _VECTORS}
+    vectors = {name: numbers({**_VECTORS, **entry}, name, (3,), where) for name in _VECTORS}
     length = float(np.linalg.norm(vectors["axis"]))
     if not length > 0:
         raise LogError(f"{where} has the axis 0; write a direction such as [0, 0, 1]")
     turn = Rotation.from_euler("xyz", vectors["rpy"]).as_matrix()
     origin = Transform(frame_name(entry["parent"]), frame_name(entry["child"]), turn, vectors["xyz"])
     return Joint(origin, vectors["axis"] / length)
-
-
-def _vector(where: str, name: str, entry: Mapping[str, Any]) -> Array:
-    given = entry.get(name, _VECTORS[name])
-    numbers = isinstance(given, list | tuple) and all(
-        isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MAX_NUMBER for value in given
-    )
-    if not numbers or len(given) != 3:
-        raise LogError(f"{where} has {name}: {reprlib.repr(given)}, which are not three numbers")
-    return np.array(given, np.float64)

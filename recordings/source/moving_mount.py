@@ -131,16 +131,6 @@ def moving_mount(
     return mount
 
 
-def other_joints(messages: DecodedTopics, joints: Mapping[str, Joint]) -> str:
-    """Which joints a log has the angles of, if none of them is known; else empty."""
-    topics = [topic for topic, schema in sorted(messages.schemas.items()) if schema == JOINTS]
-    firsts = [messages.first(topic, lambda message: list(message.name)) for topic in topics]
-    names = [name for first in firsts if not isinstance(first, LogError) for name in first]
-    if joints.keys() & set(names):
-        return ""
-    return f"it has those of {', '.join(names)}" if names else "it has no sensor_msgs/JointState"
-
-
 def _links_in(message: Any, joints: Mapping[str, Joint]) -> list[Link]:
     """The transforms that a message has."""
     if hasattr(message, "transforms"):

@@ -20,7 +20,7 @@ from recordings.source.calibration import Camera, baseline_fault, baseline_note,
 from recordings.source.cameras import CAMERAS, first_calibrations, in_known_frames, mismatched_images
 from recordings.source.joints import read_joints
 from recordings.source.mount import mount_of, pose_of_base
-from recordings.source.moving_mount import MovingMount, moving_mount, other_joints
+from recordings.source.moving_mount import MovingMount, moving_mount
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
 from recordings.source.topics import DecodedTopics, attempt
@@ -226,8 +226,9 @@ class SourceResolution:
         if not isinstance(mount, LogError):
             self.mount, self.moving = mount, moving
             return
-        if joints and (others := other_joints(self.messages, joints)):
-            self.refused["joints"] = f"the log has no angles of any joint in {self.source.joints}; {others}"
+        if joints and moving is None:
+            why = "the log has no angles of joints that join the camera and the rover"
+            self.refused["joints"] = f"{why} by {self.source.joints}; correct the names in it"
         ahead = "if x of the inclinometer points where the camera looks, and z up; a run then names a closer rotation"
         self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0.5, -0.5, 0.5, 0.5]}, ahead)]
         self.unavailable["mount"] = str(mount)

@@ -184,11 +184,11 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
     ("pan: !!timestamp x", "cannot be read as YAML"),
     ("pan: " + "[" * 2000, "cannot be read as YAML"),
     ("pan: " + "9" * 5000, "cannot be read as YAML"),
-    (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "which are not three numbers"),
+    (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "'xyz' of"),
     ("pan: [1, 2]", "joint 'pan' is not a mapping"),
     ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),
     ("pan: {parent: a}", "joint 'pan' needs the name of its frame 'child'"),
-    ("pan: {parent: a, child: b, xyz: [1, 2, x]}", "joint 'pan' has xyz: [1, 2, 'x'], which are not three numbers"),
+    ("pan: {parent: a, child: b, xyz: [1, 2, x]}", "joint 'pan' is not 3 numbers"),
     ("pan: {parent: a, child: b, axis: [0, 0, 0]}", "joint 'pan' has the axis 0"),
     ("pan: {parent: a, child", "cannot be read as YAML"),
 ])  # fmt: skip
@@ -219,9 +219,10 @@ def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
             assert log.faults() == {}
 
 
-def test_joints_that_the_log_has_no_angles_of_are_named(tmp_path):
+def test_joints_that_the_log_has_no_angles_of_are_refused(tmp_path):
     file = tmp_path / "mast.yaml"
     file.write_text("turret: {parent: base_link, child: mast, axis: [0, 0, 1]}")
     log, none = written(tmp_path / "log.mcap", angles), written(tmp_path / "none.mcap", lambda stamp: None)
-    assert refused_in(log, joints=str(file))["joints"].endswith("mast.yaml; it has those of wheel, pan")
-    assert refused_in(none, joints=str(file))["joints"].endswith("it has no sensor_msgs/JointState")
+    for path in (log, none):
+        why = refused_in(path, joints=str(file))["joints"]
+        assert why.startswith("the log has no angles of joints that join the camera and the rover by")
