@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import logging
-import re
 import sys
 import traceback
 from collections.abc import Sequence
@@ -65,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace:
     """The options of a command line. An unknown name ends the program with the nearest valid one."""
-    options, unknown = parser().parse_known_args(_joined(given) or ["--help"])
+    options, unknown = parser().parse_known_args(given or ["--help"])
     if unknown:
         valid = [option for action in options.parser._actions for option in action.option_strings]
         near = [each for each in valid if nearest(unknown[0].lstrip("-"), [each.lstrip("-")])]  # all share the dashes
@@ -73,17 +72,6 @@ def _parsed(given: Sequence[str]) -> argparse.Namespace:
         remedy = nearest(unknown[0], near) or f"; {options.parser.prog} --help lists the options{pipeline}"
         options.parser.error(f"unknown: {' '.join(unknown)}{remedy}")
     return options
-
-
-def _joined(given: Sequence[str]) -> list[str]:
-    """The words of a command line; a pair of numbers that begins with a minus is joined to its option."""
-    words = list[str]()
-    for word in given:
-        if re.match(r"-[\d.]+,", word) and words and words[-1].startswith("--"):
-            words[-1] += f"={word}"
-        else:
-            words.append(word)
-    return words
 
 
 def _interrupted(error: BaseException | None) -> bool:

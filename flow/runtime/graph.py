@@ -281,7 +281,7 @@ def array_misfit(given: type, parts: tuple[Any, ...]) -> str:
 
 def _contents(value: Any, parts: tuple[Any, ...]) -> Iterator[tuple[Any, Any, Any]]:
     """Name, item and annotated type of what is in a value; a field may be None. parts: the arguments of its type."""
-    if is_dataclass(value) and _is_own(type(value)):
+    if is_dataclass(value) and not type(value).__module__.startswith("stages."):  # a user's own
         fields = ((name, getattr(value, name), kind) for name, kind in hints_of(type(value)).items())
         yield from (field for field in fields if field[1] is not None)
     elif isinstance(value, Mapping) and parts:
@@ -289,11 +289,6 @@ def _contents(value: Any, parts: tuple[Any, ...]) -> Iterator[tuple[Any, Any, An
     elif isinstance(value, list | tuple) and parts:
         kinds = repeat(parts[0]) if isinstance(value, list) or parts[-1] is Ellipsis else parts
         yield from ((number, item, kind) for number, (item, kind) in enumerate(zip(value, kinds, strict=False)))
-
-
-def _is_own(kind: type) -> bool:
-    """Whether a class is a user's own, not one of the product."""
-    return kind.__module__.partition(".")[0] != "stages"
 
 
 def output_of(actor: Any, kinds: dict[str, type], place: YamlLocation) -> type:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -28,6 +29,7 @@ MAX_COST = 255  # of a pixel that was not searched, or that nothing resembles
 def add_arguments(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("result", type=Path, metavar="OUT.mcap", help="result log of a run")
     sub.add_argument("--at", type=instant, required=True, metavar="T", help=AT)
+    sub._negative_number_matcher = re.compile(r"-\.?\d")  # a pair may begin with a minus
     place = sub.add_mutually_exclusive_group(required=True)
     place.add_argument("--cell", type=pair, metavar="X,Y", help="position of the cell in the map's frame, m")
     place.add_argument("--pixel", type=pair, metavar="U,V", help="column and row in the left rectified image")

@@ -82,7 +82,8 @@ class Catalogue:
                 names, marks = ", ".join(known), ", ".join("?" * len(known))
                 updates = ", ".join(f"{column} = excluded.{column}" for column in values)
                 query = f"INSERT INTO logs ({names}) VALUES ({marks}) ON CONFLICT (name) DO UPDATE SET {updates}"
-                database.execute(query, [_plain(value) for value in known.values()])
+                plain = (json.dumps(value) if isinstance(value, dict | list) else value for value in known.values())
+                database.execute(query, tuple(plain))
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -154,10 +155,6 @@ def _locked(file: int, kind: int) -> bool | None:
     except OSError:
         return None
     return True
-
-
-def _plain(value: Any) -> Any:
-    return json.dumps(value) if isinstance(value, dict | list) else value
 
 
 def _shown(value: Any) -> str:

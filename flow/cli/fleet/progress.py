@@ -90,7 +90,8 @@ def watch(catalogue: Catalogue) -> int:
             for name in left.keys() - _active(rows).keys():
                 progress.end(name, rows[name])
                 del left[name]
-            progress.show({name: frames_so_far(_progress_file(catalogue, name)) or 0 for name in left})
+            files = {name: catalogue.path.parent / f"{name}{RESULT_ENDING}.progress" for name in left}
+            progress.show({name: frames_so_far(file) or 0 for name, file in files.items()})
             if left and held is False:
                 progress.say(
                     f"no process runs this fleet, {counted(len(left), 'log')} left; run its command again to continue"
@@ -124,10 +125,6 @@ def _rows(catalogue: Catalogue) -> dict[str, dict[str, Any]]:
 
 def _active(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return {name: row for name, row in rows.items() if row["state"] in ("waiting", "running")}
-
-
-def _progress_file(catalogue: Catalogue, name: str) -> Path:
-    return catalogue.path.parent / f"{name}{RESULT_ENDING}.progress"
 
 
 def _states(rows: Mapping[str, dict[str, Any]]) -> str:
