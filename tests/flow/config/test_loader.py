@@ -111,8 +111,6 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
     ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in cm or m"]),
     ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'; expected mm, cm, m, km"]),
-    ("5 ms", "5 m", 3, ["'5 m' is a length; expected a time in ms or s"]),
-    ("25 cm", "25 rad", 5, ["'25 rad' is an angle; expected a length in cm or m"]),
     ("25 cm", "25 px", 5, ["'25 px' is a number of pixels; expected a length in cm or m"]),
     ("bad: [1, 2.5]", "size: 3 cm", 5, ["'3 cm' is a length; expected a number of pixels, such as 3 px"]),
     ("25 cm", "-1 m", 5, ["at least 0 m"]),
@@ -126,7 +124,6 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("a: twice", "a: thrice", 6, ["no stream 'thrice'", "did you mean 'twice'"]),
     ("a: twice, ", "", 6, ["lacks its input 'a'"]),
     ("a: twice", "a: height", 6, ["takes Couple as 'a'", "'height' is Number"]),
-    ("couple: both", "couple: left", 5, ["takes Couple", "'left' is Number"]),
     ("couple: both", "couple: sum", 5, ["cycle", "twice -> sum -> twice"]),
     ("right: right", "right: words", 3, ["a Number cannot be paired with a Text"]),
     ("stream: level", "stream: words", 4, ["a Text cannot be interpolated"]),
@@ -151,9 +148,7 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("2.5}", f"1{'0' * 5000}}}", 1, ["looks like a YAML int but is none; quote it"]),
     ("25 cm", "2001-99-99", 5, ["'2001-99-99' looks like a YAML timestamp but is none; quote it"]),
     ("  twice:", "  my-twice:", 5, ["'my-twice' cannot name a stream"]),
-    ("  twice:", "  2nd:", 5, ["'2nd' cannot name a stream"]),
     ("  twice:", "  yes:", 5, ["'yes' is not a name", "quoted"]),
-    ("{use: tests.flow.toys.Scale", "{<<: {a: 1}, use: tests.flow.toys.Scale", 5, ["'<<' is not a name"]),
     ("  twice:", "  ? [1]\n  :", 5, ["a list or a mapping is not a name"]),
     ("a: twice", "a: [twice]", 6, ["'a' must be the name of a stream, not ['twice']"]),
     ("tests.flow.toys.Add", "[tests.flow.toys.Add]", 6, ["'use: ['tests.flow.toys.Add']' must be a module and"]),
@@ -198,7 +193,6 @@ def test_a_setting_is_filled_in_wherever_it_is_named(tmp_path):
 
 @pytest.mark.parametrize(("text", "overrides", "message"), [
     (SETTINGS.replace("$stretch", "$strech"), [], r"toy.yaml:6: there is no setting 'strech'; did you mean 'stretch'"),
-    (GOOD.replace("25 cm", "$stretch"), [], r"toy.yaml:5: there is no setting 'stretch'"),
     (SETTINGS.replace("$stretch", "2 m"), [], r"toy.yaml:1: the setting 'stretch' is not used"),
     (SETTINGS.replace("25 cm", "25 s"), [], r"toy.yaml:1: .*'25 s' is a time"),
     (SETTINGS.replace("25 cm", "25"), [], r"toy.yaml:1: .*Scale.factor: 25 needs a unit; write 25 cm or 25 m"),
@@ -207,7 +201,6 @@ def test_a_setting_is_filled_in_wherever_it_is_named(tmp_path):
     (SETTINGS, ["stretch=-1 m"], r"--set stretch=-1 m: .*at least 0 m"),
     (SETTINGS, ["strech=1 m"], r"--set strech=1 m: the pipeline has no setting 'strech'; did you mean 'stretch'"),
     (SETTINGS, ["disparities=1"], r"--set disparities=1: the pipeline has no setting 'disparities'; it has .*stretch"),
-    (SETTINGS, ["etc=1"], r"--set etc=1: the pipeline has no setting 'etc'; it has .*stretch"),
     (SETTINGS, ["strech.a=1 m"], r"--set strech.a=1 m: there is no stream 'strech'; did you mean 'stretch'"),
     (SETTINGS, ["Scale.factor=1 m"], r"--set Scale.factor=1 m: write the stream in place of its class 'Scale': twice"),
     (SETTINGS, ["twice=1 m"], r"--set twice=1 m: name the parameter of 'twice', as in twice.parameter=value"),
@@ -222,9 +215,8 @@ def test_an_invalid_setting_is_named(tmp_path, text, overrides, message):
 
 
 @pytest.mark.parametrize("setting", [
-    "nonsense", "twice=3", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "a.b", "twice.factor=-1",
-    "twice.bad=!!python/x y", "twice.factor.sign=3", "twice..factor=3", "twice.bad=!!int x", "twice.bad=" + "[" * 3000,
-    "twice.bad=&a [*a]",
+    "nonsense", "twise.factor=3", "twice.faktor=3", "twice.bad=[", "twice.bad=!!python/x y", "twice.factor.sign=3",
+    "twice.bad=!!int x", "twice.bad=&a [*a]",
 ])  # fmt: skip
 def test_an_invalid_set_option_is_named(tmp_path, setting):
     with pytest.raises((PipelineError, UsageError), match="--set"):
@@ -303,9 +295,8 @@ def test_stages_may_be_in_the_folder_of_the_pipeline_file(tmp_path):
 
 
 @pytest.mark.parametrize(("value", "unit", "text"), [
-    (5_000_000, "ns", "5 ms"), (100_000_000, "ns", "100 ms"), (1.5, "s", "1.5 s"), (0.05, "m", "5 cm"),
-    (math.radians(20), "rad", "20 deg"), (math.radians(60), "rad", "60 deg"), (0, "ns", "0"), (128, "px", "128"),
-    (12.0, "m", "12 m"), (0.25, "", "0.25"),
+    (100_000_000, "ns", "100 ms"), (0.05, "m", "5 cm"), (math.radians(60), "rad", "60 deg"), (12.0, "m", "12 m"),
+    (0, "ns", "0"), (128, "px", "128"),
 ])  # fmt: skip
 def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, text):
     assert as_written(value, unit) == text

@@ -125,8 +125,6 @@ def test_optional_applies_to_the_inner_streams(tmp_path):
     ("      first:", "      couple:", "toy.yaml:8: 'couple' is already an input of template 'scaled_twice'"),
     ("factor: $second", "factor: 1 m",
      "toy.yaml:5: the parameter 'second' of 'scaled_twice' is not used; write $second"),
-    ("factor: $second", "factor: $secund, bad: [$second]",
-     "toy.yaml:9: template 'scaled_twice' has no parameter 'secund'; did you mean 'second'?"),
     ("factor: $second", "factor: $secund",
      "toy.yaml:9: template 'scaled_twice' has no parameter 'secund'; did you mean 'second'?"),
     ("couple: first", "couple: $couple",
@@ -209,10 +207,7 @@ def test_one_rover_reaches_every_stage_that_needs_it(name):
     ("McapSnk.compression=zstd", "there is no stream 'McapSnk'; did you mean 'McapSink'?"),
     ("McapSink.also=[disparity/fall]", "there is no stream 'disparity/fall'; did you mean 'disparity/full'?"),
     ("RerunSink.without=[cloud, clowd]", "no stream of the frames matches 'clowd'; did you mean 'cloud'?"),
-    ("RerunSink.without=[terrain/*]", "no stream of the frames matches 'terrain/*'"),
     ("RerunSink.live_pipe=3", "recordings.RerunSink has no parameter 'live_pipe'; it has max_width, jpeg_quality"),
-    ("RerunSink.limits=[a=1]", "recordings.RerunSink has no parameter 'limits'; it has max_width, jpeg_quality"),
-    ("McapSink.inputs=[a.mcap]", "recordings.McapSink has no parameter 'inputs'; it has results, also"),
 ])  # fmt: skip
 def test_a_mistake_in_the_rover_or_a_sink_names_the_setting(override, message):
     with pytest.raises(PipelineError) as caught:

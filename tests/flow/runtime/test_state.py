@@ -79,7 +79,6 @@ START, FINDING = "def start(self): ...", "def finding(self, state): ..."
 @pytest.mark.parametrize(("methods", "takes", "sentence"), [
     ("", ", *, state", "Half.__call__ needs a 'state', so Half must have 'start', which makes it"),
     (START, "", r"Half has 'start', so its __call__ must take 'state' by keyword only \(after '\*'\)"),
-    (START, ", state", r"Half has 'start', so its __call__ must take 'state' by keyword only"),
     (FINDING, "", "Half.finding needs a 'state', so Half must have 'start', which makes it"),
 ])  # fmt: skip
 def test_a_stage_with_half_of_a_state_is_refused_with_its_line(tmp_path, methods, takes, sentence):
