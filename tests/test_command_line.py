@@ -165,17 +165,6 @@ def test_the_recording_verifies_and_contains_every_intermediate(result):
     assert {stream.partition("/")[0] for stream in streams} >= {"points", "elevation_map", "navigation_map"}
 
 
-@pytest.mark.parametrize("pipeline", ["rover", *slow("paper")])
-def test_results_do_not_depend_on_the_number_of_workers(traverse, tmp_path, pipeline):
-    logs = []
-    for workers in (1, 4):
-        out = tmp_path / f"{workers}.mcap"
-        assert roverflow("run", traverse, "-p", pipeline, *SMALL, "-o", out, "--no-rrd", "--workers", workers) == 0
-        logs.append(raw_messages(out))
-    assert len(logs[0]) >= 6 * FRAMES
-    assert logs[0] == logs[1]
-
-
 @pytest.mark.parametrize(("part", "compared"), [
     (("--end", 1.1), 2),
     (("--start", 0.52), FRAMES - 1),  # the first frame's stamp is before that time, and its messages were logged after
