@@ -26,7 +26,6 @@ class Outcome:
 
     fault: str
     where: str
-    seconds: float
     megabytes: float
 
 
@@ -44,16 +43,16 @@ def isolated(work: Callable[[], object], limited: bool = True) -> Outcome:
     with open(reader, "rb") as pipe:  # noqa: PTH123  # a descriptor
         base, _, told = pipe.read().decode("utf-8", "replace").partition("\n")
     _, status, used = os.wait4(child, 0)
-    seconds, megabytes = used.ru_utime + used.ru_stime, (used.ru_maxrss - int(base)) / 1000
+    megabytes = (used.ru_maxrss - int(base)) / 1000
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         late = number in (signal.SIGALRM, signal.SIGXCPU)
-        return Outcome(f"took {MAX_SECONDS} s" if late else f"ended by signal {number}", told, seconds, megabytes)
+        return Outcome(f"took {MAX_SECONDS} s" if late else f"ended by signal {number}", told, megabytes)
     if os.WEXITSTATUS(status):
         fault, _, where = told.partition("\n")
-        return Outcome(fault or f"ended with exit code {os.WEXITSTATUS(status)}", where, seconds, megabytes)
+        return Outcome(fault or f"ended with exit code {os.WEXITSTATUS(status)}", where, megabytes)
     is_large = limited and megabytes > MAX_MEGABYTES
-    return Outcome(f"took {megabytes:.0f} MB" if is_large else "", "", seconds, megabytes)
+    return Outcome(f"took {megabytes:.0f} MB" if is_large else "", "", megabytes)
 
 
 def _run(work: Callable[[], object], writer: int, limited: bool) -> None:
