@@ -1,7 +1,5 @@
 """The regional map from the command line: computed with any pose, and exported as a whole."""
 
-from collections import Counter
-
 import cv2
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2 import from_msg as ros2
 from stages.data import Cell, CellReason
 from tests.bench.regional import RUNS, region, shares_within, traverse_of
-from tests.conftest import FRAMES, SMALL, roverflow
+from tests.conftest import FRAMES
 from tests.test_command_line import messages_of
 
 REGIONAL = {"/nav/regional_map", "/nav/regional_navigation_map"}
@@ -47,18 +45,6 @@ def test_a_result_log_contains_the_reason_of_every_cell(result, stream):
         for state, reasons_of_state in expected.items():
             assert set(np.unique(navigation.reason[navigation.cells == state]).tolist()) <= {*reasons_of_state}
         assert CellReason.STEP in navigation.reason
-
-
-def test_export_without_a_regional_map_exports_the_frames(traverse, tmp_path, refused):
-    out = tmp_path / "out.mcap"
-    assert roverflow("run", traverse, "-p", "paper", *SMALL, "-o", out, "--no-rrd", "--end", 0.8) == 0
-    counts = Counter(topic for topic, _, _ in iter_decoded(out))
-    assert not REGIONAL & set(counts)
-    why = refused("export", out, tmp_path / "maps")
-    assert "contains no /nav/regional_map, only " in why
-    assert "--frames" in why
-    assert roverflow("export", out, tmp_path / "maps", "--frames") == 0
-    assert len(list((tmp_path / "maps").glob("frame-*/elevation.tif"))) == 1
 
 
 def test_the_regional_map_of_a_traverse_is_exported(result, tmp_path, said):
