@@ -23,7 +23,6 @@ Legend = Mapping[int, tuple[str, Rgb]]  # code -> name, colour
 
 MIN_SAMPLES = 4096  # values that a colour range is found from, where there are so many
 LINE_SPACING = 2  # m, between the lines across a map
-METRES_BEHIND = 1.0  # m behind the rover that a picture shows if nothing is known farther behind
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
 _ORIGIN_RGB: tuple[Rgb, ...] = (  # by code
@@ -195,15 +194,6 @@ def birds_eye(grid: Array) -> Array:
     return view
 
 
-def birds_eyes(grids: Sequence[Array], factors: Sequence[float]) -> tuple[Array, Array]:
-    """Grids of one shape times a factor each, as pictures (n, H, W) float32 and float16, see `birds_eye`."""
-    views = np.empty((len(grids), *grids[0].shape[::-1]), np.float32)
-    for view, grid, factor in zip(views, grids, factors, strict=True):
-        np.multiply(grid.T[::-1, ::-1], np.float32(factor), out=view)
-    with np.errstate(over="ignore"):  # beyond 65504, such as seconds after 18 hours, a value is infinite
-        return views, views.astype(np.float16)
-
-
 def distance_lines(
     shape: tuple[int, int], origin: tuple[float, float], resolution: float, rover: tuple[float, float] | None
 ) -> tuple[list[Any], dict[str, Any]]:
@@ -235,28 +225,6 @@ def way_on(grid: ElevationMap | NavigationMap, shape: tuple[int, int], way: Sequ
     edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int))).reshape(-1, 2)
     pixels = (size - cells)[:, ::-1]
     return [pixels[first:end].tolist() for first, end in edges if end > first + 1]
-
-
-def terrain_ahead(terrain: ElevationMap) -> ElevationMap:
-    """The terrain without the columns farther than `METRES_BEHIND` behind its origin, if nothing is known of them."""
-    columns, origin = _behind(terrain, np.isfinite(terrain.layers["elevation"]))
-    return replace(terrain, layers={name: layer[:, columns:] for name, layer in terrain.layers.items()}, origin=origin)
-
-
-def navigation_ahead(navigation: NavigationMap) -> NavigationMap:
-    """The same of a navigation map."""
-    columns, origin = _behind(navigation, navigation.cells != Cell.UNKNOWN)
-    return replace(
-        navigation, cells=navigation.cells[:, columns:], reason=navigation.reason[:, columns:], origin=origin
-    )
-
-
-def _behind(grid: ElevationMap | NavigationMap, known: Array) -> tuple[int, tuple[float, float]]:
-    """How many columns to leave out, and the origin of what is left."""
-    columns = max(0, round((-METRES_BEHIND - grid.origin[0]) / grid.resolution))
-    if known[:, :columns].any():
-        columns = 0
-    return columns, (grid.origin[0] + columns * grid.resolution, grid.origin[1])
 
 
 def elevation_limits(elevation: Array) -> tuple[float, float]:

@@ -14,6 +14,7 @@ from recordings.sinks import colormaps
 from recordings.sinks.blueprint import Panel, ViewSpec
 from recordings.sinks.canvas import CAMERA_RGB, MAX_POINTS, Canvas, label_counts
 from recordings.sinks.entity_rows import components_of, drawn, fields_of
+from recordings.sinks.map_cropping import ahead
 from stages.data import (
     LEVEL_FRAME,
     Array,
@@ -265,7 +266,7 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
 
     Of a regional map only the layers that say which frames it is made of are drawn; the result log has all.
     """
-    terrain = colormaps.terrain_ahead(terrain)
+    terrain = ahead(terrain)
     elevation, suffix = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
     low, high = canvas.limits(stream, *colormaps.elevation_limits(elevation))
     rgb, known = colormaps.elevation_colors(terrain, (low, high), exact=False), np.isfinite(elevation)
@@ -291,15 +292,13 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
 def _log_layers(canvas: Canvas, stream: str, terrain: ElevationMap, heights: tuple[float, float]) -> None:
     """The layers of a terrain. heights: the ends of the scale of elevations, m."""
     layers = terrain.layers if terrain.frame_id == LEVEL_FRAME else colormaps.provenance(terrain)
-    if not layers:
-        return
-    scales, suffix = [LAYER_SCALES.get(name, (0.0, "")) for name in layers], _frame_suffix(terrain.frame_id)
-    factors = [float(np.degrees(1.0)) if unit == "deg" else 1.0 for _, unit in scales]
-    pictures = zip(*colormaps.birds_eyes([*layers.values()], factors), strict=True)
-    for name, (end, unit), (picture, values) in zip(layers, scales, pictures, strict=True):
-        view = ViewSpec(
-            Panel.LAYER, stream, f"layers/{rr.escape_entity_path_part(name)}", name + suffix, terrain.frame_id
-        )
+    for name, layer in layers.items():
+        end, unit = LAYER_SCALES.get(name, (0.0, ""))
+        picture = colormaps.birds_eye(np.degrees(layer) if unit == "deg" else layer)
+        with np.errstate(over="ignore"):  # beyond 65504, such as seconds after 18 hours, a value is infinite
+            values = picture.astype(np.float16)
+        part, title = f"layers/{rr.escape_entity_path_part(name)}", name + _frame_suffix(terrain.frame_id)
+        view = ViewSpec(Panel.LAYER, stream, part, title, terrain.frame_id)
         if name == "elevation":
             canvas.log_values(values, heights, view, "m", cv2.COLORMAP_VIRIDIS)
         elif unit:
@@ -311,7 +310,7 @@ def _log_layers(canvas: Canvas, stream: str, terrain: ElevationMap, heights: tup
 @logger_for(NavigationMap)
 def log_navigation(canvas: Canvas, stream: str, navigation: NavigationMap) -> str:
     """The states of the cells, and their reasons."""
-    navigation = colormaps.navigation_ahead(navigation)
+    navigation = ahead(navigation)
     cells, suffix = colormaps.birds_eye(navigation.cells), _frame_suffix(navigation.frame_id)
     view = ViewSpec(Panel.MAP, stream, "cells", f"navigation{suffix}")
     canvas.log_labels(view, cells, colormaps.CELL_LEGEND)

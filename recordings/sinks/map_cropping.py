@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from stages.data import LEVEL_FRAME, RIM_WIDTH, Array, Cell, CellReason, ElevationMap, NavigationMap
 from stages.data.arrays import Span, spanned
 
+_Map = TypeVar("_Map", ElevationMap, NavigationMap)
 Grid = tuple[str, tuple[float, float], float, tuple[int, ...]]  # frame, origin, resolution and shape
+METRES_BEHIND = 1.0  # m behind the rover that a picture shows if nothing is known farther behind
 COUNTS = {"count", "frames", "contradictions"}  # layers that are 0, not NaN, where nothing is known
 
 
@@ -41,6 +43,14 @@ def known_cells(grid: ElevationMap | NavigationMap) -> Array:
     return known
 
 
+def ahead(grid: _Map) -> _Map:
+    """A map without the columns farther than `METRES_BEHIND` behind its origin, if nothing is known of them."""
+    columns = max(0, round((-METRES_BEHIND - grid.origin[0]) / grid.resolution))
+    known = grid.cells != Cell.UNKNOWN if isinstance(grid, NavigationMap) else np.isfinite(grid.layers["elevation"])
+    found: _Map = grid if known[:, :columns].any() else _part(grid, slice(0, None), slice(columns, None))
+    return found
+
+
 def _grid_of(item: ElevationMap | NavigationMap) -> Grid:
     shape = item.shape if isinstance(item, ElevationMap) else item.cells.shape
     return item.frame_id, item.origin, item.resolution, shape
@@ -57,7 +67,7 @@ def _window(known: Array, rim: int) -> Span:
     return spanned(known, rim) if known.any() else (slice(0, known.shape[0]), slice(0, known.shape[1]))
 
 
-def _part(item: ElevationMap | NavigationMap, rows: slice, cols: slice) -> ElevationMap | NavigationMap:
+def _part(item: ElevationMap | NavigationMap, rows: slice, cols: slice) -> Any:
     """The cells of a map in a window."""
     (x, y), step = item.origin, item.resolution
     origin = x + cols.start * step, y + rows.start * step

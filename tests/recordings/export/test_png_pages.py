@@ -180,20 +180,6 @@ def test_sixteen_bit_images_keep_their_contrast():
     assert colormaps.top_eight_bits(eight, bright)[0] is eight
 
 
-def test_unknown_ground_behind_the_rover_is_not_drawn():
-    elevation = np.full((4, 80), np.nan, np.float32)
-    elevation[1, 50] = 1.0
-    terrain = ElevationMap(0, {"elevation": elevation}, 0.05, (-2.0, 0.0), "level")
-    ahead = colormaps.terrain_ahead(terrain)
-    assert (ahead.shape, ahead.origin) == ((4, 60), (-1.0, 0.0))
-    assert ahead.layers["elevation"][1, 30] == 1.0
-    cells = np.where(np.isfinite(elevation), 0, -1).astype(np.int8)
-    navigation = NavigationMap(0, cells, np.zeros_like(cells, np.uint8), 0.05, (-2.0, 0.0), "level")
-    assert colormaps.navigation_ahead(navigation).cells[1, 30] == 0
-    behind = np.where(np.arange(80) == 3, np.float32(1.0), elevation)
-    assert colormaps.terrain_ahead(ElevationMap(0, {"elevation": behind}, 0.05, (-2.0, 0.0), "level")).shape == (4, 80)
-
-
 @pytest.mark.parametrize(("value", "text"), [(-0.0, "0"), (-5.55e-17, "0"), (-0.25, "-0.25"), (112.0, "112")])
 def test_scale_values_have_few_digits_and_no_minus_zero(value, text):
     assert colormaps.format_value(value) == text

@@ -1,12 +1,14 @@
 """Maps without empty cells: the known ones keep their places and their values."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.scoring.metrics import aligned
-from recordings.sinks.map_cropping import cropped
+from recordings.sinks.map_cropping import ahead, cropped
 from stages.data import Cell, CellReason, ElevationMap, NavigationMap
 
 ROWS, COLS, STEP = 120, 90, 0.05
@@ -63,3 +65,15 @@ def test_a_layer_of_zeros_is_known_unless_it_counts():
         layers = {**terrain.layers, name: zeros}
         found = cropped({"terrain": ElevationMap(0, layers, STEP, terrain.origin, "level")})
         assert found["terrain"].shape == shape
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_unknown_ground_behind_the_rover_is_not_drawn(behind):
+    known = np.zeros((4, 80), bool)
+    known[1, 50], known[2, 3] = True, behind
+    terrain, cells = maps(known).values()
+    cells = replace(cells, cells=np.where(known, Cell.FREE, Cell.UNKNOWN).astype(np.int8))
+    left_out = 0 if behind else 20
+    assert ahead(terrain).origin == ahead(cells).origin == pytest.approx((-2.0 + left_out * STEP, -3.0))
+    np.testing.assert_array_equal(ahead(terrain).layers["count"], terrain.layers["count"][:, left_out:])
+    np.testing.assert_array_equal(ahead(cells).reason, cells.reason[:, left_out:])
