@@ -76,8 +76,15 @@ def test_the_names_of_curves_stand_beside_a_plot_and_hide_none(rrd):
     assert rows(rrd, "/curves/ANGLE", "Points2D:labels")[-1][2] == [
         "inclinometer x up", "inclinometer y up", "camera pitch down", "camera roll right"
     ]  # fmt: skip
-    colors = [rows(rrd, f"/tilt/inclinometer\\ {axis}\\ up", "SeriesLines:colors")[-1][2][0] for axis in "xy"]
-    assert rows(rrd, "/curves/ANGLE", "Points2D:colors")[-1][2][:2] == colors
+    curves = (
+        "tilt/inclinometer x up",
+        "tilt/inclinometer y up",
+        "points/camera pitch down",
+        "points/camera roll right",
+    )
+    colors = [rows(rrd, f"/{name}".replace(" ", "\\ "), "SeriesLines:colors") for name in curves]
+    assert rows(rrd, "/curves/ANGLE", "Points2D:colors")[-1][2] == [color for ((_, _, (color,)),) in colors]
+    assert len({color for ((_, _, (color,)),) in colors}) == 4
 
 
 def test_a_camera_image_stays_in_its_place_whatever_hazards_are_drawn_over_it(rrd):

@@ -104,12 +104,20 @@ def test_images_are_recognisable(rrd):
     assert np.abs(left.astype(int) - scene()["rectified"].left).mean() < 8
 
 
-def test_the_same_pixels_are_stored_once(rrd, tmp_path):
-    assert "/stereo/left" not in entities(rrd)
+def test_what_a_later_stream_shows_too_is_drawn_once(tmp_path):
     items = scene()
-    raw = items["stereo"]
-    items["stereo"] = StereoFrame(raw.stamp, raw.left.copy(), raw.right, raw.camera)
-    assert {"/stereo/left", "/rectified/left"} <= entities(record_of(tmp_path / "raw.rrd", [Record(START, items)]))
+    frame, pose, terrain = (items[name] for name in ("rectified", "pose", "elevation_map"))
+    heights = terrain.layers["elevation"]
+    shown = {
+        "raw": StereoFrame(START, frame.left.copy(), frame.right, frame.camera), "stereo": frame, "rectified": frame,
+        "logged": pose, "pose": pose, "cells": replace(terrain, layers={"elevation": heights}),
+        "other": replace(terrain, layers={"elevation": heights + np.float32(1)}), "elevation_map": terrain,
+    }  # fmt: skip
+    streams = {name: type(item) for name, item in shown.items()}
+    drawn = entities(record_of(tmp_path / "run.rrd", [Record(START, shown)], streams=streams))
+    assert {entity.split("/")[1] for entity in drawn} & shown.keys() == {
+        "raw", "rectified", "pose", "other", "elevation_map"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(("camera_width", "max_width", "widths"), [
@@ -251,15 +259,6 @@ def test_scalars_are_those_of_the_frame(rrd):
     assert tilt == [pytest.approx(np.degrees(0.1))]
 
 
-def test_curves_of_one_plot_differ_in_colour(rrd):
-    names = [f"/tilt/inclinometer {axis} up" for axis in "xy"]
-    names += [f"/points/camera {way}" for way in ("pitch down", "roll right")]
-    escaped = ["/".join(map(rr.escape_entity_path_part, name.split("/"))) for name in names]
-    colours = [rows(rrd, name, "SeriesLines:colors") for name in escaped]
-    assert [len(found) for found in colours] == [1] * 4  # once, for all frames
-    assert len({found[0][2][0] for found in colours}) == 4
-
-
 def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd, tmp_path):
     (_, _, turn), *_ = rows(rrd, "/health/" + rr.escape_entity_path_part("tilt off turn"), "Scalars:scalars")
     assert turn[0] == pytest.approx(np.degrees(0.01))
@@ -274,13 +273,6 @@ def test_the_tilt_check_is_plotted_and_its_fault_logged_once(rrd, tmp_path):
     assert [value for *_, value in rows(path, "/ledger/health", "TextLog:text")] == [["turn it round"]]
     assert rows(path, "/ledger", "TextLog:text")[-1][2] == ["health: the sign of pitch is flipped"]
     assert rows(path, "/ledger", "TextLog:level")[-1][2] == ["ERROR"]
-
-
-def test_the_logs_own_pose_is_drawn_once(tmp_path):
-    pose = scene()["pose"]
-    record = Record(START, {"logged": pose, "pose": pose})
-    path = record_of(tmp_path / "run.rrd", [record], streams={"logged": Pose, "pose": Pose})
-    assert [entity for entity in entities(path) if "trajectory" in entity] == ["/pose/trajectory"]
 
 
 def test_a_pair_is_drawn_alike_with_a_moved_right_image():

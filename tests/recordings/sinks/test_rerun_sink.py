@@ -3,7 +3,6 @@
 import math
 import subprocess
 import sys
-import threading
 
 import cv2
 import numpy as np
@@ -161,18 +160,6 @@ def test_the_bottleneck_is_named_first(tmp_path):
     *_, (*_, (document,)) = rows(path, "/summary", "TextDocument:text")
     table = "\n\n| | |\n|---|---|\n| slowest stage | disparity, 0.372 s a frame |\n| workers | nothing |\n"
     assert document.startswith(f"# COMPLETE{table}")
-
-
-def test_frames_may_come_from_different_threads(tmp_path):
-    """rerun sets its clocks per thread; a thread without them logs for all times."""
-    sink = opened(tmp_path / "threads.rrd")
-    for n in range(4):
-        thread = threading.Thread(target=sink.write, args=(Record(START + n * STEP, scene(START + n * STEP)),))
-        thread.start()
-        thread.join()
-    sink.close({"verdict": "COMPLETE"})
-    times = [row[:2] for row in rows(tmp_path / "threads.rrd", "/points/points", "Points3D:positions")]
-    assert times == [(START + n * STEP, n) for n in range(4)]
 
 
 def test_a_recording_has_its_name_only_when_it_is_complete(tmp_path):

@@ -23,18 +23,6 @@ def labels_of(recording, layer):
     return rows(recording, f"/elevation_map/layers/{layer}/scale/text", "Points2D:labels")[0][2]
 
 
-def test_a_map_that_a_later_map_contains_is_not_drawn_twice(tmp_path):
-    items = scene()
-    assessed = items.pop("elevation_map")
-    cells = replace(assessed, layers={"elevation": assessed.layers["elevation"]})
-    other = replace(assessed, layers={"elevation": assessed.layers["elevation"] + np.float32(1)})
-    maps = {"cells": cells, "other": other, "elevation_map": assessed}
-    streams = dict.fromkeys(maps, ElevationMap)
-    drawn = entities(record_of(tmp_path / "a.rrd", [Record(START, maps)], streams=streams))
-    assert {"/other/relief", "/elevation_map/relief", "/elevation_map/layers/slope"} <= drawn
-    assert not any(entity.startswith("/cells") for entity in drawn)
-
-
 def test_fewer_shades_of_a_relief_leave_unknown_cells_their_colour():
     heights = np.random.default_rng(1).normal(size=(9, 7)).astype(np.float32)
     heights[2:5, 3] = np.nan
