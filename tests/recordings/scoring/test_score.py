@@ -31,7 +31,7 @@ from recordings.scoring.table import (
 )  # fmt: skip
 from recordings.simulator import Simulation, ground_truth, write_log
 from recordings.simulator.texture import TerrainClass
-from stages.data import Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
+from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Transform
 from tests.conftest import chunks_of, mcap_rows, rewrite, with_broken, write_mcap
 
 SMALL = Simulation(
@@ -169,6 +169,8 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert hazards["recall"] == 1
     assert hazards["false_safe"] == hazards["false_alarm"] == hazards["unknown"] == 0
     assert hazards["free_on_rock"] == 0
+    hallucinated = found.terrain["hallucinated"]
+    assert hallucinated["claimed"] == 0 < hallucinated["of_values"] < hallucinated["unseen"]  # all are interpolated
     assert rocks["0.2 m"]["visible"] > 5
     assert rocks["0.2 m"]["recall"] == rocks["0.3 m"]["recall"] == 1
     assert found.tilt["frames"] == 2
@@ -176,49 +178,37 @@ def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
     assert found.untilted == {}
 
 
-@pytest.mark.parametrize("changed", [{"fx": 200.0}, {"baseline": 0.25}])
-def test_disparities_of_another_camera_are_not_compared(tmp_path, truth, frames, changed):
-    found = scored(tmp_path, truth, frames, lens=changed)
-    assert found.disparity is None
-    ((why, count),) = found.unscored["/nav/disparity"].items()
-    assert "its camera has f = " in why
-    assert count == 2
-    assert found.terrain is not None
+WIDE = r"its cells are 0\.1 m wide, the truth's 0\.05 m; run with that resolution"
 
 
-def test_maps_of_another_resolution_are_not_scored_but_all_else_is(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, resolution=0.1)
-    assert found.terrain is None
-    reasons = {"its cells are 0.1 m wide, the truth's 0.05 m; run with that resolution": 2}
-    assert found.unscored == {"/nav/elevation_map": reasons, "/nav/navigation_map": reasons}
-    assert found.disparity["bad_1"] == 0
-    assert found.tilt["frames"] == 2
-    assert "not scored   /nav/navigation_map: 2 frames: its cells are 0.1 m wide" in format_score(found)
+@pytest.mark.parametrize(("changed", "reasons"), [
+    ({"lens": {"fx": 200.0}}, {"disparity": "its camera has f = .*"}),
+    ({"lens": {"baseline": 0.25}}, {"disparity": "its camera has f = .*"}),
+    ({"resolution": 0.1}, {"elevation_map": WIDE, "navigation_map": WIDE}),
+    ({"resolution": 0.1, "navigation": 0.05},
+     {"elevation_map": WIDE, "navigation_map": "the frame's other map does not fit the truth"}),
+    ({"lower": 0.1}, dict.fromkeys(("elevation_map", "navigation_map"),
+     r"its origin is 1\.\d\d m from the camera, the truth's \(base_link\) \d\.\d\d m")),
+])  # fmt: skip
+def test_what_does_not_fit_the_truth_is_not_scored_but_all_else_is(tmp_path, truth, frames, changed, reasons):
+    found = scored(tmp_path, truth, frames, **changed)
+    assert found.unscored.keys() == {f"/nav/{name}" for name in reasons}
+    for name, reason in reasons.items():
+        ((why, count),) = found.unscored[f"/nav/{name}"].items()
+        assert re.fullmatch(reason, why)
+        assert count == 2
+        assert f"not scored   /nav/{name}: 2 frames: {why[:15]}" in format_score(found)
     assert max(map(len, format_score(found).splitlines())) <= 100
+    assert (found.disparity is None, found.terrain is None) == ("disparity" in reasons, "elevation_map" in reasons)
+    assert found.tilt["frames"] == 2
     assert main(["score", str(tmp_path / "out.mcap"), "--truth", str(truth)]) == 3
-    assert scored(tmp_path, truth, frames, resolution=0.1, skipped=(1,)).terrain is None
-
-
-def test_maps_with_another_origin_than_base_link_are_not_scored(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, lower=0.1)
-    assert found.terrain is None
-    (reason,) = found.unscored["/nav/elevation_map"]
-    assert re.fullmatch(r"its origin is 1\.\d\d m from the camera, the truth's \(base_link\) \d\.\d\d m", reason)
-
-
-def test_a_map_is_not_scored_if_the_other_map_does_not_fit(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, resolution=0.1, navigation=0.05)
-    assert found.terrain is None
-    assert found.unscored == {
-        "/nav/elevation_map": {"its cells are 0.1 m wide, the truth's 0.05 m; run with that resolution": 2},
-        "/nav/navigation_map": {"the frame's other map does not fit the truth": 2},
-    }
 
 
 def test_a_result_with_no_comparable_message_is_not_scored(tmp_path, truth, frames):
     only = ("/nav/elevation_map", "/nav/navigation_map")
     with pytest.raises(LogError, match=r"no result fits the truth in .*: /nav/elevation_map: its cells"):
         scored(tmp_path, truth, frames, only=only, resolution=0.1)
+    assert scored(tmp_path, truth, frames, resolution=0.1, skipped=(1,)).terrain is None
 
 
 def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
@@ -228,15 +218,6 @@ def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth
     assert found["leftmost_columns_cropped"] == sorted(set(widths))
     kept = [(frame.seen == 255)[:, width:].sum() for frame, width in zip(frames, widths, strict=True)]
     assert found["nonocc"]["pixels"] == sum(kept)
-
-
-def test_values_where_no_camera_sees_the_ground_are_hallucinated(tmp_path, truth, frames):
-    x = (np.arange(320) + 0.5) * 0.05 - 8
-    near = np.hypot(x[None, :], x[:, None]) < 8
-    in_view = [ground_truth.truth_maps(SMALL, 0, frame)[0].layers["in_view"][near] > 0.5 for frame in frames]
-    found = scored(tmp_path, truth, frames).terrain["hallucinated"]
-    assert found["of_values"] == pytest.approx(1 - np.mean(in_view))
-    assert found["claimed"] == 0 < found["unseen"]  # the map marks all cells as interpolated
 
 
 def test_a_smaller_map_is_compared_by_place_and_loses_completeness(tmp_path, truth, frames):
@@ -266,14 +247,10 @@ def test_the_columns_of_several_rows_have_their_units():
     assert brief_columns([]) == {}
 
 
-def test_free_cells_on_rocks_or_out_of_view_are_shares_of_free_cells(tmp_path, truth, frames):
-    maps = [ground_truth.truth_maps(SMALL, 0, frame) for frame in frames]
-    found = scored(tmp_path, truth, frames, cells=np.zeros_like).terrain["hazards"]
-    assert found["free_on_rock"] == np.mean([navigation.reason == CellReason.STEP for _, navigation in maps])
-    assert found["free_unseen"] == np.mean([terrain.layers["in_view"] < 0.5 for terrain, _ in maps])
-
-
 def test_a_missing_frame_scores_as_one_of_unknown_cells(tmp_path, truth, frames):
+    alone = scored(tmp_path, truth, frames, only=("/nav/disparity",))
+    assert alone.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
+    assert alone.terrain["hazards"]["unknown"] == alone.disparity["density"] == 1
     silent = scored(tmp_path, truth, frames, skipped=(1,))
     honest = scored(tmp_path, truth, frames, blind=(1,))
     assert silent.disparity == honest.disparity
@@ -304,14 +281,6 @@ def test_an_unscored_tilt_has_a_reason(tmp_path, truth, frames):
 def test_the_tilt_error_is_the_angle_between_the_two_ups(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, tilt_error=0.01)
     assert (found.tilt["mean"], found.tilt["max"]) == pytest.approx((0.01, 0.01), abs=1e-6)
-
-
-def test_results_without_maps_score_as_maps_of_unknown_cells(tmp_path, truth, frames):
-    partial = scored(tmp_path, truth, frames, only=("/nav/disparity",))
-    assert partial.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
-    assert partial.terrain["heights"]["0-8 m"]["completeness"] == partial.terrain["hazards"]["recall"] == 0
-    assert partial.terrain["rocks"]["0.2 m"]["detected"] == 0
-    assert partial.terrain["hazards"]["unknown"] == partial.disparity["density"] == 1
 
 
 def test_results_at_stamps_without_truth_are_reported_not_scored(tmp_path, truth, frames):
