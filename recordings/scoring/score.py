@@ -196,7 +196,7 @@ class _Tally:
         if self._has({"/truth/disparity"}, {"/truth/occlusion"}, frame):
             row |= self._add_disparity(stamp, frame)
         if self._has({"/truth/elevation_map", "/truth/navigation_map"}, {"/truth/rocks"}, frame):
-            row |= self._add_terrain(stamp, frame)
+            row |= self._add_terrain(frame)
         if "/truth/tilt" in frame:
             row |= self._add_tilt(frame)
         if "/truth/pose" in frame:
@@ -234,7 +234,7 @@ class _Tally:
             return {}
         columns = cropped_columns(frame["/truth/disparity"].max_disparity)
         occlusion, codes = (
-            self._mask(f"/truth/{name}", stamp, frame, true.shape) for name in ("occlusion", "terrain_class")
+            _mask(frame.get(f"/truth/{name}")) for name in ("occlusion", "terrain_class")
         )  # fmt: skip
         errors = StereoErrors.of(estimate, true, occlusion, columns)
         self.disparity = self.disparity + errors if self.disparity else errors
@@ -244,29 +244,11 @@ class _Tally:
         found = errors.metrics()
         return {f"disparity_{name}": found[name] for name in ("density", "bad_1", "rmse")}
 
-    def _mask(self, topic: str, stamp: int, frame: dict[str, Any], shape: tuple[int, ...]) -> Array | None:
-        """The pixels of a mono8 image of the truth; None if the frame has none."""
-        mask = frame.get(topic)
-        if mask is None:
-            return None
-        if (mask.height, mask.width) != shape:
-            raise LogError(
-                f"{self.truth}: {topic} at {stamp} ns is {mask.width}x{mask.height}, /truth/disparity is "
-                f"{shape[1]}x{shape[0]}; make the truth again"
-            )
-        return np.asarray(mask.data).reshape(mask.height, mask.step)[:, : mask.width]
-
-    def _add_terrain(self, stamp: int, frame: dict[str, Any]) -> dict[str, float]:
+    def _add_terrain(self, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_grid_map(frame["/truth/elevation_map"])
-        try:
-            hazard = _cells(frame["/truth/navigation_map"], true) == Cell.HAZARD
-        except ValueError as error:
-            where = f"{self.truth}: /truth/navigation_map at {stamp} ns"
-            raise LogError(f"{where}: {error}; make the truth again") from error
+        hazard = _cells(frame["/truth/navigation_map"], true) == Cell.HAZARD
         rocks = _rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 6))
         ground = TrueGround.of(true, hazard, rocks)
-        if ground is None:
-            raise LogError(f"{self.truth}: /truth at {stamp} ns lacks layers of the truth; simulate it again")
         fitting, unfit = dict[str, Any](), dict[str, str]()
         elsewhere = self._elsewhere(frame)
         for topic, read in (("/nav/elevation_map", _layers), ("/nav/navigation_map", _cells)):
@@ -341,6 +323,13 @@ class _Tally:
             found.tilt = {"frames": len(tilts), "mean": float(np.mean(tilts)), "max": max(tilts)}
         found.pose = self.pose.metrics()
         return found
+
+
+def _mask(message: Any | None) -> Array | None:
+    """The pixels of a mono8 image of the truth; None if the frame has none."""
+    return (
+        None if message is None else np.asarray(message.data).reshape(message.height, message.step)[:, : message.width]
+    )
 
 
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:

@@ -54,11 +54,11 @@ class TrueGround:
     rocks: Array
 
     @classmethod
-    def of(cls, terrain: ElevationMap, hazard: Array, rocks: Array) -> TrueGround | None:
-        """The truth from a map with the layers of the simulator; None if layers are missing."""
+    def of(cls, terrain: ElevationMap, hazard: Array, rocks: Array) -> TrueGround:
+        """The truth from a map with the layers of the simulator. Raises ValueError if any is missing."""
         layers = terrain.layers
         if not {"mean", "visible", "in_view", "rock", "slope"} <= layers.keys() or rocks.shape[1] != 6:
-            return None
+            raise ValueError("the truth lacks layers or fields that the simulator writes")
         x, y = cell_centres(terrain)
         seen = (layers["visible"] > 0.5) & in_ring(np.hypot(x[None, :], y[:, None]), 0.0, MAX_DISTANCE)
         return cls(x, y, layers["mean"].astype(np.float64), seen, layers["in_view"] > 0.5, hazard, layers["rock"],

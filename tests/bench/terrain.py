@@ -82,7 +82,6 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
         elevation, hazards = ground_truth.truth_maps(simulation, stamp, truth)
         rocks = ground_truth.rocks_in_level(simulation, truth)[:, [0, 1, 3, 4, 5, 6]]
         ground = TrueGround.of(elevation, hazards.cells == Cell.HAZARD, rocks)
-        assert ground is not None
         yield given, exact, ground
 
 

@@ -32,7 +32,7 @@ from recordings.scoring.table import (
 from recordings.simulator import Simulation, ground_truth, write_log
 from recordings.simulator.texture import TerrainClass
 from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Transform
-from tests.conftest import chunks_of, mcap_rows, rewrite, with_broken, write_mcap
+from tests.conftest import chunks_of, edit_of, mcap_rows, rewrite, with_broken, write_mcap
 
 SMALL = Simulation(
     scene="mixed", frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
@@ -337,6 +337,18 @@ def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, trut
         writer.write("/nav/dense", ros2.grid_map(ElevationMap(1, ones, 0.05, (0, 0), "level")), 1)
     with pytest.raises(LogError, match=r"none of /nav/disparity, .*, only /nav/dense: the run produced none, or"):
         scoring.score(tmp_path / "other.mcap", truth)
+
+
+@pytest.mark.parametrize(("topic", "schema", "edit", "why"), [
+    ("/occlusion", "sensor_msgs/msg/Image", lambda _, image: setattr(image, "height", 1), "cannot reshape"),
+    ("/navigation_map", "nav_msgs/msg/OccupancyGrid", lambda _, grid: setattr(grid.header, "frame_id", "x"), "it is "),
+    ("/elevation_map", "grid_map_msgs/msg/GridMap", lambda _, grid: grid.layers.__setitem__(2, "x"), "the truth lacks"),
+])  # fmt: skip
+def test_a_truth_that_cannot_be_scored_is_named_with_the_reason(tmp_path, truth, frames, topic, schema, edit, why):
+    other = rewrite(truth, tmp_path / "other.mcap", edit_of(f"truth{topic}", schema, edit))
+    place = rf"out.mcap or .*other.mcap has a message at {SMALL.stamp(0)} ns that cannot be scored: {why}.*; record"
+    with pytest.raises(LogError, match=place):
+        scored(tmp_path, other, frames)
 
 
 def test_a_truth_in_several_files_is_that_of_one(tmp_path, truth, frames):
