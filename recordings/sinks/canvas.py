@@ -7,7 +7,7 @@ viewer never shows an old picture as this frame's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from textwrap import wrap
@@ -20,7 +20,7 @@ import rerun as rr
 from recordings.png import png
 from recordings.sinks import colormaps
 from recordings.sinks.blueprint import CURVES, LEDGER, LEDGER_CHARS, Panel, ViewSpec
-from recordings.sinks.colormaps import UNKNOWN_RGB, Legend, Rgb
+from recordings.sinks.colormaps import UNKNOWN_RGB, Legend, Point, Rgb
 from recordings.sinks.entity_rows import (
     At,
     Component,
@@ -53,6 +53,7 @@ ROW_BESIDE = 0.27  # least height of a row of a legend beside the picture, share
 MAX_UNIT_CHARS = 3  # of a unit that stands at each value of a scale; a longer one stands at the last
 CLEARED = components_of(rr.Clear(recursive=False))
 (NUMBER,) = (one.descriptor for one in components_of(rr.Scalars(0.0)))
+LINE_SPACING = 2  # m, between the lines across a map
 HEADROOM = 0.35  # above the first row of a legend, share of the height of a row
 
 
@@ -62,7 +63,7 @@ class Canvas:
 
     views: every entity that was ever logged, in the order of the first time; the blueprint is made from it. camera: of
     the first frame; identifies streams of another image size. What does not change from frame to frame, such as a
-    legend, is logged once (`keep`), which halves the number of calls.
+    legend, is logged once, which halves the number of calls.
     """
 
     recording: rr.RecordingStream
@@ -81,10 +82,8 @@ class Canvas:
     ways: dict[str, list[tuple[float, float]]] = field(default_factory=dict)  # frame -> x and y of the poses so far
     _curves: dict[Panel, list[str]] = field(default_factory=dict)
     _texts: dict[str, str] = field(default_factory=dict)
-    _legends: dict[str, Legend] = field(default_factory=dict)
     _present: dict[str, set[int]] = field(default_factory=dict)
     _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    _kept: dict[str, Hashable] = field(default_factory=dict)
     _recurred: dict[str, tuple[Component, ...]] = field(default_factory=dict)
     _veiled: set[str] = field(default_factory=set)
     _before: dict[str, type] = field(default_factory=dict)
@@ -104,29 +103,21 @@ class Canvas:
         self,
         path: str,
         kind: type,
-        content: Sequence[Component],
+        content: Sequence[Component] = (),
         recurring: tuple[Component, ...] = (),
     ) -> None:
         """Log an entity. What recurs is left out while it is that of the last frame, which the viewer then takes."""
         logged = {*map(id, self._recurred.get(path, ()))} if path in self._before else ()
-        changed = (one for one in recurring if id(one) not in logged)
-        self._recurred[path] = recurring
-        self.rows.add(path, self.at, (*content, *changed))
-        self._now[path] = kind
+        row = (*content, *(one for one in recurring if id(one) not in logged))
+        self._recurred[path], self._now[path] = recurring, kind
+        if row:
+            self.rows.add(path, self.at, row)
         if self.counts_bytes:
-            self.logged_bytes += sum(one.nbytes for one in (*content, *recurring))
+            self.logged_bytes += sum(one.nbytes for one in row)
 
     def add_view(self, view: ViewSpec) -> None:
         """Add a view to the blueprint."""
         self.views.setdefault((view.panel, view.path), view)
-
-    def keep(self, path: str, content: Hashable, draw: Callable[[], Any]) -> None:
-        """Log what `draw()` returns, unless the last frame had it with the same `content`."""
-        if path in self._before and self._kept.get(path) == content:
-            self._now[path] = self._before[path]
-        else:
-            self._kept[path] = content
-            self.log(path, draw())
 
     def keep_all(self, stream: str) -> None:
         """Leave the entities of a stream as they were in the last frame."""
@@ -261,12 +252,8 @@ class Canvas:
         self, view: ViewSpec, codes: Array, legend: Legend, beside: bool = False, counts: Array | None = None
     ) -> None:
         """A label image (H, W); its names are above or beside it and appear on hover. counts: its `label_counts`."""
-        path = view.path
-        if self._legends.get(path) != legend:
-            self._legends[path] = legend
-            self.recording.log(path, _annotations(tuple(legend.items())), static=True)
-        labels = codes.astype(np.uint8, copy=False)
-        self._log_raw(f"{path}/labels", rr.SegmentationImage, labels)
+        path, labels = view.path, codes.astype(np.uint8, copy=False)
+        self._log_raw(f"{path}/labels", rr.SegmentationImage, labels, _annotations(tuple(legend.items())))
         self.add_view(view)
         counts = label_counts(labels) if counts is None else counts
         present = self._present.setdefault(path, set())  # codes of any frame so far, so that the legend stays
@@ -282,21 +269,14 @@ class Canvas:
     ) -> None:
         """Named dots above a picture of (H, W), in a row of at most four or rows of three; or in two columns beside."""
         named = tuple(entries)
-        self.keep(path, (shape, named), lambda: _dots(shape, named, beside))
-        self.keep(f"{path}/text", (shape, named), lambda: _names(shape, named, beside))
+        for part, draw in (("", _dots), ("/text", _names)):
+            self.log_components(f"{path}{part}", rr.Points2D, recurring=draw(shape, named, beside))
 
     def log_distances(self, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
         """Lines across a bird's-eye view at every second metre of x, with distances; the rover's place and way."""
-        content, thin = (shape, grid.origin, grid.resolution, colormaps.rover_place(grid)), rr.Radius.ui_points(0.6)
-        lines: dict[str, Any] = {"colors": [(255, 255, 255, 80)], "radii": thin, "draw_order": 20.0}
-        points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
-        self.keep(path, content, lambda: drawn(rr.LineStrips2D, strips=colormaps.distance_lines(*content)[0], **lines))
-        self.keep(
-            f"{path}/distances",
-            content,
-            lambda: drawn(rr.Points2D, **colormaps.distance_lines(*content)[1], show_labels=True, **points),
-        )
-
+        lines, marks = _distances(shape, grid.origin, grid.resolution, colormaps.rover_place(grid))
+        self.log_components(path, lines.kind, recurring=lines.components)
+        self.log_components(f"{path}/distances", marks.kind, recurring=marks.components)
         ways = colormaps.way_on(grid, shape, self.ways.get(grid.frame_id, []))
         if ways:
             shown: dict[str, Any] = {"colors": [CAMERA_RGB], "radii": rr.Radius.ui_points(1.2), "draw_order": 22.0}
@@ -329,9 +309,10 @@ def label_counts(labels: Array) -> Array:
 
 
 @lru_cache(maxsize=16)
-def _annotations(legend: tuple[tuple[int, tuple[str, Rgb]], ...]) -> rr.AnnotationContext:
+def _annotations(legend: tuple[tuple[int, tuple[str, Rgb]], ...]) -> tuple[Component, ...]:
     """The names and the colours of labels."""
-    return rr.AnnotationContext([rr.AnnotationInfo(code & 0xFF, name, rgb) for code, (name, rgb) in legend])
+    infos = [rr.AnnotationInfo(code & 0xFF, name, rgb) for code, (name, rgb) in legend]
+    return components_of(rr.AnnotationContext(infos))
 
 
 @lru_cache(maxsize=256)
@@ -347,7 +328,8 @@ def _scale(
     return tuple(zip(names, colors, strict=True))
 
 
-def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> Drawn:
+@lru_cache(maxsize=256)
+def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> tuple[Component, ...]:
     """The dots of a legend."""
     dots, _, rows, row_height = _places(shape, len(entries), beside)
     colors, radii = [rgb for _, rgb in entries], [5.0] * len(entries)
@@ -356,15 +338,17 @@ def _dots(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bo
         # row's dots whole.
         above = [(x, -(rows + HEADROOM) * row_height) for x, y in dots if y == dots[0][1]]
         dots, colors, radii = [*dots, *above], colors + [(0, 0, 0)] * len(above), radii + [0.0] * len(above)
-    return drawn(rr.Points2D, positions=dots, colors=colors, radii=rr.Radius.ui_points(radii), draw_order=30.0)
+    sizes = rr.Radius.ui_points(radii)
+    return drawn(rr.Points2D, positions=dots, colors=colors, radii=sizes, draw_order=30.0).components
 
 
-def _names(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> Drawn:
+@lru_cache(maxsize=256)
+def _names(shape: tuple[int, ...], entries: Sequence[tuple[str, Rgb]], beside: bool) -> tuple[Component, ...]:
     """The names of a legend. A label takes the colour of its dot, which may be as dark as the background, so labels
     have dots of their own."""
     _, pins, *_ = _places(shape, len(entries), beside)
     texts: dict[str, Any] = {"labels": [name for name, _ in entries], "show_labels": True, "draw_order": 31.0}
-    return drawn(rr.Points2D, positions=pins, colors=[TEXT_RGB], radii=rr.Radius.ui_points(0.5), **texts)
+    return drawn(rr.Points2D, positions=pins, colors=[TEXT_RGB], radii=rr.Radius.ui_points(0.5), **texts).components
 
 
 def _places(
@@ -382,3 +366,22 @@ def _places(
         return dots, [(x + 0.33 * width, y - 0.45 * pitch) for x, y in dots], rows, row_height
     dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
     return dots, dots, rows, row_height
+
+
+@lru_cache(maxsize=256)
+def _distances(shape: tuple[int, int], origin: Point, resolution: float, rover: Point | None) -> tuple[Drawn, Drawn]:
+    """Lines across a bird's-eye view of a grid at every second metre of x, and named points: distances, rover."""
+    width = float(shape[0])
+    far, left = (start + count * resolution for start, count in zip(origin, shape[::-1], strict=True))
+    first, last = np.ceil(origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
+    ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
+    depths = (far - ahead) / resolution
+    marks, names = [(width, depth) for depth in depths], [f"{x:.0f} m" for x in ahead]
+    if rover is not None:
+        marks, names = [*marks, ((left - rover[1]) / resolution, (far - rover[0]) / resolution)], [*names, "rover"]
+    strips, thin = [[(0.0, depth), (width, depth)] for depth in depths], rr.Radius.ui_points(0.6)
+    points: dict[str, Any] = {"colors": [(255, 255, 255)], "radii": rr.Radius.ui_points(2.0), "draw_order": 21.0}
+    return (
+        drawn(rr.LineStrips2D, strips=strips, colors=[(255, 255, 255, 80)], radii=thin, draw_order=20.0),
+        drawn(rr.Points2D, positions=marks, labels=names, show_labels=True, **points),
+    )

@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,7 +21,6 @@ Point = tuple[float, float]
 Legend = Mapping[int, tuple[str, Rgb]]  # code -> name, colour
 
 MIN_SAMPLES = 4096  # values that a colour range is found from, where there are so many
-LINE_SPACING = 2  # m, between the lines across a map
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)
 _ORIGIN_RGB: tuple[Rgb, ...] = (  # by code
@@ -192,21 +190,6 @@ def birds_eye(grid: Array) -> Array:
     """A grid (rows along y, columns along x, ...) as a picture: x forward is up, y left is left."""
     view: Array = cv2.flip(cv2.transpose(grid), -1)
     return view
-
-
-def distance_lines(
-    shape: tuple[int, int], origin: tuple[float, float], resolution: float, rover: tuple[float, float] | None
-) -> tuple[list[Any], dict[str, Any]]:
-    """Lines across a bird's-eye view of a grid at every second metre of x, and named points: distances, rover."""
-    width = float(shape[0])
-    far, left = (start + count * resolution for start, count in zip(origin, shape[::-1], strict=True))
-    first, last = np.ceil(origin[0] / LINE_SPACING), np.floor(far / LINE_SPACING)
-    ahead = LINE_SPACING * np.arange(first, last + 1) + 0.0  # no minus zero
-    depths = (far - ahead) / resolution
-    marks, names = [(width, depth) for depth in depths], [f"{x:.0f} m" for x in ahead]
-    if rover is not None:
-        marks, names = [*marks, ((left - rover[1]) / resolution, (far - rover[0]) / resolution)], [*names, "rover"]
-    return [[(0.0, depth), (width, depth)] for depth in depths], {"positions": marks, "labels": names}
 
 
 def rover_place(grid: ElevationMap | NavigationMap) -> tuple[float, float] | None:

@@ -67,7 +67,7 @@ def test_only_the_logs_clock_and_the_frame_count_are_timelines(rrd):
 def test_legends_that_do_not_change_are_stored_once(rrd):
     for legend in ("/disparity/source/legend", "/disparity/pixels/scale/text", "/elevation_map/relief/lines/distances"):
         assert [frame for _, frame, _ in rows(rrd, legend, "Points2D:positions")] == [0], legend
-    assert len(rows(rrd, "/disparity/source", "AnnotationContext:context")) == 1
+    assert len(rows(rrd, "/disparity/source/labels", "AnnotationContext:context")) == 1
 
 
 def test_entities_that_a_frame_lacks_are_cleared_at_that_frame(tmp_path):
