@@ -321,15 +321,14 @@ def first_smallest(typing_context: Any, value: Any) -> Any:
 
 
 @_intrinsic
-def outermost(typing_context: Any, value: Any, step: Any) -> Any:
-    """The lane that the next `shifted` by `step` pushes out: the last for step 1, the first for step -1."""
-    result, last = types.Integer.from_bitwidth(value.bits, False), step.literal_value > 0
+def last_lane(typing_context: Any, value: Any) -> Any:
+    """The lane that the next `shifted` up pushes out."""
+    result: Any = types.Integer.from_bitwidth(value.bits, False)
 
     def generate(context: Any, b: Any, signature: Any, args: Any) -> Any:
-        chunk = b.extract_value(args[0], value.count - 1 if last else 0)
-        return b.extract_element(chunk, _I32(value.chunk - 1 if last else 0))
+        return b.extract_element(b.extract_value(args[0], value.count - 1), _I32(value.chunk - 1))
 
-    return result(value, step), generate
+    return result(value), generate
 
 
 @_intrinsic

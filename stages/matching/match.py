@@ -218,9 +218,9 @@ class Match(Stage):
     def _search_area(self, prior: Disparity | None, search: range, rows: int) -> SearchArea:
         """The disparities that are searched at each pixel, or in each band of rows."""
         if prior is not None and self.search_radius:
-            return windows_around(prior.pixels, self.search_radius, search.start, self.threads)
+            return windows_around(prior.pixels, self.search_radius, search.start)
         if prior is not None and self.band_height:
-            return row_ranges(prior.pixels, self.band_height, search.start, len(search), self.threads)
+            return row_ranges(prior.pixels, self.band_height, search.start, len(search))
         return whole_range(rows, len(search))
 
     def _noise_measures(self, prior: Disparity, frame: StereoFrame) -> tuple[Array | None, Array, Array]:
@@ -250,7 +250,7 @@ class Match(Stage):
         else:
             firsts = [np.full((each.end - each.top, 1), search.start + each.first, np.int32) for each in area]
             first, lanes = np.concatenate(firsts), lanes_for(len(search))
-        return prior_costs(prior.pixels, first, lanes, self.prior_weight, MAX_PRIOR_DISTANCE, self.threads, gain)
+        return prior_costs(prior.pixels, first, lanes, self.prior_weight, MAX_PRIOR_DISTANCE, gain)
 
     def _excluded(self, prior: Disparity, search: range, area: SearchArea) -> Array:
         """Why pixels are excluded from the search, (H, W) uint8: codes of `PixelOrigin`, 0 where they are searched.

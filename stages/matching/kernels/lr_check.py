@@ -21,23 +21,14 @@ def drop_inconsistent(found: Layers, backward: Layers, tolerance: float, max_dis
     of the swapped frame, so mirrored.
     """
     left = np.empty_like(found[0]), np.empty_like(found[1]), np.empty_like(found[2])
-    _drop(*found, *backward[:2], F32(tolerance), F32(max_disparity), *left)
+    _drop(found, backward[:2], F32(tolerance), F32(max_disparity), left)
     return left
 
 
 @kernel
-def _drop(
-    pixels,
-    source,
-    confidence,
-    backward,
-    backward_source,
-    tolerance,
-    max_disparity,
-    left_pixels,
-    left_source,
-    left_confidence,
-):
+def _drop(found, backward, tolerance, max_disparity, left):
+    (pixels, source, confidence), (there_pixels, there_source) = found, backward
+    left_pixels, left_source, left_confidence = left
     last = pixels.shape[1] - 1
     for y in range(pixels.shape[0]):
         for x in range(pixels.shape[1]):
@@ -46,7 +37,7 @@ def _drop(
             differs = False
             if d <= max_disparity and partner >= 0 and partner <= last:
                 there = last - np.int64(partner)
-                differs = _known(backward_source[y, there]) and abs(backward[y, there] - d) > tolerance
+                differs = _known(there_source[y, there]) and abs(there_pixels[y, there] - d) > tolerance
             left_pixels[y, x] = F32(np.nan) if differs else d
             left_source[y, x] = LEFT_RIGHT if differs else source[y, x]
             left_confidence[y, x] = F32(0) if differs else confidence[y, x]

@@ -12,7 +12,6 @@ from functools import lru_cache
 import numpy as np
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 from stages.matching.kernels.texture import BLOCK
 
@@ -23,30 +22,24 @@ TABLE_MARGIN = 16  # lanes
 
 
 def prior_costs(
-    prior: Array, minimum: int | Array, lanes: int, weight: float, max_distance: float, threads: int = 1,
-    gain: Array | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
+    prior: Array, minimum: int | Array, lanes: int, weight: float, max_distance: float, gain: Array | None = None
+) -> tuple[Array, Array]:
     """The index at which each pixel's costs begin, and the table of costs.
 
     prior: (H, W) float32, px, NaN = none; minimum: the smallest disparity searched, px, or that of each pixel, int32
     that broadcasts to (H, W); weight: cost per pixel of distance, in units of the matching cost; max_distance: px, from
-    which the cost grows no more; threads: 2 share the work, with the same result; gain: what the weight is multiplied
-    by in each block of 4 x 4 px, (rows, cols) float32, 1 to MAX_GAIN. Returns (H, W) int32 and (m,) uint8.
+    which the cost grows no more; gain: what the weight is multiplied by in each block of 4 x 4 px, (rows, cols)
+    float32, 1 to MAX_GAIN. Returns (H, W) int32 and (m,) uint8.
     """
     # A prior so far outside the search range costs the same everywhere.
     far = lanes + int(np.ceil(max_distance)) + TABLE_MARGIN
     length, gains = 2 * far + lanes, 1 if gain is None else GAINS
     table = _table(lanes, far, weight, max_distance, gains)
-    begin, least = np.empty(prior.shape, np.int32), np.broadcast_to(minimum, prior.shape)
-    steps = np.zeros((0, 0), np.uint8)
+    begin, steps = np.empty(prior.shape, np.int32), np.zeros((0, 0), np.uint8)
     if gain is not None:
         steps = np.rint((gain - 1) * F32((GAINS - 1) / (MAX_GAIN - 1))).astype(np.uint8)
-
-    def work(first: int, end: int) -> None:
-        apart = np.subtract(prior[first:end], least[first:end], dtype=np.float32)
-        _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, steps, gains, first, begin[first:end])
-
-    by_bands(shared_by(threads), len(prior), work)
+    apart = np.subtract(prior, minimum, dtype=np.float32)
+    _begin(apart, -PHASES * (far - lanes), PHASES * far, length, far, steps, gains, begin)
     return begin, table
 
 
@@ -62,13 +55,13 @@ def _table(lanes: int, far: int, weight: float, max_distance: float, gains: int)
 
 
 @kernel
-def _begin(apart, least, most, length, far, steps, gains, first, begin):
+def _begin(apart, least, most, length, far, steps, gains, begin):
     for y in range(apart.shape[0]):
         for x in range(apart.shape[1]):
             quarters = np.rint(apart[y, x] * np.float32(PHASES))
             known = np.isfinite(quarters)
             whole = np.int64(min(max(quarters, least), most)) if known else 0
-            table = PHASES * (steps[(first + y) // BLOCK, x // BLOCK] if steps.size else 0)
+            table = PHASES * (steps[y // BLOCK, x // BLOCK] if steps.size else 0)
             begin[y, x] = (
                 (table + whole % PHASES) * length + far - whole // PHASES if known else gains * PHASES * length
             )

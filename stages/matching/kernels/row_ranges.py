@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.compiled.jit import kernel
-from stages.compiled.parallel import by_bands, shared_by
 from stages.compiled.simd import Width
 from stages.data import Array, PixelOrigin
 
@@ -45,21 +44,16 @@ def whole_range(rows: int, disparities: int) -> list[Range]:
     return [Range(0, rows, 0, Width(lanes_for(disparities)))]
 
 
-def row_ranges(prior: Array, height: int, minimum: int, disparities: int, threads: int = 1) -> list[Range]:
+def row_ranges(prior: Array, height: int, minimum: int, disparities: int) -> list[Range]:
     """The bands of an image, of `height` rows each, and their ranges.
 
-    prior: (H, W) float32, px, NaN = unknown; minimum, disparities: px, the whole range; threads: 2 share the work, with
-    the same result.
+    prior: (H, W) float32, px, NaN = unknown; minimum, disparities: px, the whole range.
     """
     rows, columns = prior.shape
     cuts = [*range(0, rows, height), rows]
     counts = np.zeros((len(cuts) - 1, disparities), np.int64)
-
-    def count(first: int, end: int) -> None:
-        for i in range(first, end):
-            _count(prior, cuts[i], cuts[i + 1], minimum, counts[i])
-
-    by_bands(shared_by(threads), len(counts), count)
+    for (top, end), number in zip(itertools.pairwise(cuts), counts, strict=True):
+        _count(prior[top:end], minimum, number)
     most, ranges = lanes_for(disparities), []
     for i, (top, end) in enumerate(itertools.pairwise(cuts)):
         enough = MIN_KNOWN_SHARE * (end - top) * columns
@@ -88,10 +82,10 @@ def by_range(rows: range, ranges: list[Range]) -> Iterator[tuple[range, Range]]:
 
 
 @kernel
-def _count(prior, top, end, minimum, counts):
-    """Add the histogram of the disparities in rows top to end; those beyond the range count at its end."""
+def _count(prior, minimum, counts):
+    """Add the histogram of the disparities; those beyond the range count at its end."""
     last = np.float32(counts.size - 1)
-    for y in range(top, end):
+    for y in range(prior.shape[0]):
         for x in range(prior.shape[1]):
             place = np.rint(prior[y, x]) - np.float32(minimum)
             if np.isfinite(place):

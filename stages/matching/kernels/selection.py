@@ -20,9 +20,9 @@ from stages.compiled.simd import (
     count_up,
     first_smallest,
     lanes_in,
+    last_lane,
     lesser,
     load,
-    outermost,
     shifted,
     smallest,
     store,
@@ -37,34 +37,24 @@ MEASURED, OUT_OF_VIEW, OUT_OF_RANGE, LEFT_RIGHT, UNIQUENESS = (
 
 
 @part
-def find_winners(total, beyond, guard, step, winner, votes, right, width):
+def find_winners(total, beyond, guard, winner, votes, right, width):
     """The best disparity of each pixel of a row, left and right; the smallest of equals.
 
     total: (W * n,) uint8, the sums; beyond: (n,) uint8, 255 for lanes that are no disparities; guard: (2 n,) uint8, 255
-    at n - 1, n, n + 1, else 0; step: direction through the row, with the same result. Into winner (W,)
-    int16, votes (4, W) uint16: sum of the winner, of its lower and upper neighbour, and the smallest of the others; and
-    right (W + n,) uint8 or uint16: the right image's winners, backwards, that of the partner of left
-    pixel x at disparity d at W - 1 - x + d.
+    at n - 1, n, n + 1, else 0. Into winner (W,) int16, votes (4, W) uint16: sum of the winner, of its lower and upper
+    neighbour, and the smallest of the others; and right (W + n,) uint8 or uint16: the right image's winners, backwards,
+    that of the partner of left pixel x at disparity d at W - 1 - x + d.
     """
     n, columns = lanes_in(width), winner.size
     lanes, outside = count_up(width, right), load(beyond, 0, width)
     best, index = broadcast(255, width), lanes
-    if step > 0:
-        for x in range(columns):
-            sums = bit_or(load(total, x * n, width), outside)
-            find_winner(sums, total, guard, x, winner, votes, width)
-            best, index = shifted(best, 255, 1), shifted(index, 0, 1)
-            index, best = where_less(sums, best, lanes, index), lesser(sums, best)
-            right[columns + n - 2 - x] = outermost(index, 1)
-        store(right, 0, index)
-    else:
-        for x in range(columns - 1, -1, -1):
-            sums = bit_or(load(total, x * n, width), outside)
-            find_winner(sums, total, guard, x, winner, votes, width)
-            best, index = shifted(best, 255, -1), shifted(index, 0, -1)
-            index, best = where_less(best, sums, index, lanes), lesser(sums, best)
-            right[columns - 1 - x] = outermost(index, -1)
-        store(right, columns - 1, index)
+    for x in range(columns):
+        sums = bit_or(load(total, x * n, width), outside)
+        find_winner(sums, total, guard, x, winner, votes, width)
+        best, index = shifted(best, 255, 1), shifted(index, 0, 1)
+        index, best = where_less(sums, best, lanes, index), lesser(sums, best)
+        right[columns + n - 2 - x] = last_lane(index)
+    store(right, 0, index)
 
 
 @part

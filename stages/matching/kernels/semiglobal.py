@@ -136,7 +136,7 @@ def _sweep(inputs, params, layers, width, scratch, first_lane, top, paths, y, en
         aggregate_row(inputs, params, scratch.costs, paths, y, step, sums, place, scratch.total, final, width)
         if final:
             find_winners(
-                scratch.total, scratch.beyond, scratch.guard, step, scratch.winner, scratch.votes, scratch.right, width
+                scratch.total, scratch.beyond, scratch.guard, scratch.winner, scratch.votes, scratch.right, width
             )
             find_partners(scratch.winner, scratch.right, scratch.partners)
             fit_row(

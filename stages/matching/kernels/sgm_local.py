@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.compiled.jit import kernel, part
-from stages.compiled.parallel import Fork, by_bands, shared_by
+from stages.compiled.parallel import Fork
 from stages.compiled.simd import (
     Width,
     average,
@@ -50,19 +50,14 @@ class SearchWindows(NamedTuple):
     width: Width
 
 
-def windows_around(prior: Array, radius: int, min_disparity: int, threads: int = 1) -> SearchWindows:
+def windows_around(prior: Array, radius: int, min_disparity: int) -> SearchWindows:
     """Windows that reach `radius` px from the prior to either side, within the image and not below `min_disparity`.
 
-    prior: (H, W) float32, px; a pixel without a prior (NaN) has the window of the pixel to the left; threads: 2 share
-    the work, with the same result.
+    prior: (H, W) float32, px; a pixel without a prior (NaN) has the window of the pixel to the left.
     """
     lanes = -(-(2 * (radius + WINDOW_EDGE) + WINDOW_STEP + 1) // 16) * 16
     first = np.empty(prior.shape, np.int32)
-
-    def work(top: int, end: int) -> None:
-        _begin(prior[top:end], lanes, min_disparity, first[top:end])
-
-    by_bands(shared_by(threads), len(prior), work)
+    _begin(prior, lanes, min_disparity, first)
     return SearchWindows(first, Width(lanes))
 
 
