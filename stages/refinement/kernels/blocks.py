@@ -33,8 +33,8 @@ WEIGHT, RESIDUAL, EXPECTED = 3, 4, 5  # of the matches: their weight, variance a
 BOUND, CORRELATION = 6, 7  # variance of the plane by the images' gradients; correlation of these
 PLANE_LAYERS = 8
 LANES = 16  # windows that are summed side by side
-MAX_RADIUS = 2  # blocks, of a window
-WIDE = LANES + 2 * MAX_RADIUS  # blocks of a row that these windows contain
+RADIUS = 2  # blocks; windows are 5 x 5 blocks
+WIDE = LANES + 2 * RADIUS  # blocks of a row that these windows contain
 START, SUMS = 0, 3  # in the work array: the planes that the windows start from; sums over the windows:
 S_N, S_X, S_Y, S_XX, S_XY, S_YY, S_R, S_XR, S_YR, S_RR, S_VARIANCE, S_LR, S_LL, S_RIGHT = range(SUMS, SUMS + 14)
 WORK_LAYERS = SUMS + 14
@@ -108,8 +108,8 @@ def _gather(pixels, guessed, guide, left, right, scale, first, end, blocks):
             block[LR], block[LL], block[RR] = lr, ll, rr
 
 
-def fit_windows(blocks: Array, start: Array | None, radius: int, size: int, both: Fork) -> Array:
-    """The planes, (PLANE_LAYERS, rows, cols) float32, of windows of 2 * radius + 1 blocks around each block.
+def fit_windows(blocks: Array, start: Array | None, size: int, both: Fork) -> Array:
+    """The planes, (PLANE_LAYERS, rows, cols) float32, of the windows around each block.
 
     size: of a block, px; start: planes that the windows' blocks have to be near; None: those of 3 x 3 blocks, whichever
     these are.
@@ -118,7 +118,7 @@ def fit_windows(blocks: Array, start: Array | None, radius: int, size: int, both
         level = np.zeros((3, *blocks.shape[1:]), np.float32)
         level[C] = blocks[MEAN]
         start = _fitted(blocks, level, 1, size, False, both)
-    return _fitted(blocks, start, radius, size, True, both)
+    return _fitted(blocks, start, RADIUS, size, True, both)
 
 
 def _fitted(blocks: Array, start: Array, radius: int, size: int, gated: bool, both: Fork) -> Array:
@@ -137,9 +137,9 @@ def _fit(blocks, start, radius, size, gated, first, end, planes):
             work[SUMS * LANES :] = 0
             _copy(start, j, i, work, LANES, 3)
             for down in range(max(-radius, -j), min(radius, height - 1 - j) + 1):
-                _copy(blocks, j + down, i - MAX_RADIUS, row, WIDE, BLOCK_LAYERS)
+                _copy(blocks, j + down, i - RADIUS, row, WIDE, BLOCK_LAYERS)
                 for across in range(-radius, radius + 1):
-                    _add(row[MAX_RADIUS + across :], work, F32(across) * size, F32(down) * size, gated)
+                    _add(row[RADIUS + across :], work, F32(across) * size, F32(down) * size, gated)
             for lane in range(min(LANES, width - i)):
                 _solve(work, lane, planes[:, j, i + lane])
 

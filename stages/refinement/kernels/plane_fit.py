@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stages.compiled.jit import fast_part, kernel, part
-from stages.compiled.parallel import Fork, by_bands, in_turn, shared_by
+from stages.compiled.parallel import by_bands, shared_by
 from stages.data import Array
 
 F32 = np.float32
@@ -45,36 +45,24 @@ def fit_planes(
     """
     assert weights.shape == labels.shape, "a weight for each pixel"
     planes = Planes(np.empty((count, 3)), np.empty(count, np.float32), np.empty(count, np.float32))
-    both = shared_by(threads)
-    points, start, sizes = known_points(disparity, labels, count, weights, both)
+    points, start, sizes = known_points(disparity, labels, count, weights)
     given = points, start, sizes, hypotheses, U64(seed % 2**64)
-    by_bands(both, count, lambda first, end: _fit(*given, first, end, *planes))
+    by_bands(shared_by(threads), count, lambda first, end: _fit(*given, first, end, *planes))
     return planes
 
 
-def known_points(
-    disparity: Array, labels: Array, count: int, weights: Array, both: Fork = in_turn
-) -> tuple[Array, Array, Array]:
+def known_points(disparity: Array, labels: Array, count: int, weights: Array) -> tuple[Array, Array, Array]:
     """The known pixels, region by region, each in scan order.
 
     Parameters as in `fit_planes`. Returns (4, n) float32: column, row, disparity and weight; (count + 1,) int64: region
     s has the points start[s] to start[s + 1]; and (count,) int64: the size of each region, with its unknown pixels.
     """
-    middle = labels.shape[0] // 2
-    parts = slice(middle), slice(middle, labels.shape[0])
-    ahead, behind = np.zeros((2, 2, count), np.int64)
-    both(
-        lambda: _count_points(disparity[parts[0]], labels[parts[0]], *ahead),
-        lambda: _count_points(disparity[parts[1]], labels[parts[1]], *behind),
-    )
-    start = np.concatenate([[0], np.cumsum(ahead[0] + behind[0])])
+    known, sizes = np.zeros((2, count), np.int64)
+    _count_points(disparity, labels, known, sizes)
+    start = np.concatenate([[0], np.cumsum(known)])
     points = np.empty((4, start[-1]), np.float32)
-    given = disparity, labels, weights
-    both(
-        lambda: _gather(*given, 0, middle, start[:-1].copy(), points),
-        lambda: _gather(*given, middle, labels.shape[0], start[:-1] + ahead[0], points),
-    )
-    return points, start, ahead[1] + behind[1]
+    _gather(disparity, labels, weights, start[:-1].copy(), points)
+    return points, start, sizes
 
 
 @kernel
@@ -92,9 +80,9 @@ def _count_points(disparity, labels, known, sizes):
 
 
 @kernel
-def _gather(disparity, labels, weights, first, end, place, points):
-    width = labels.shape[1]
-    for y in range(first, end):
+def _gather(disparity, labels, weights, place, points):
+    height, width = labels.shape
+    for y in range(height):
         x = 0
         while x < width:
             region = labels[y, x]

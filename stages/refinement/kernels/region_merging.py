@@ -37,7 +37,7 @@ def merge_regions(image: Array, labels: Array, count: int, groups: int) -> tuple
 def _superpixel_points(image: Array, labels: Array, count: int, scale: float) -> tuple[Array, Array]:
     """Mean colour (CIELAB, L in 0..100), y and x times `scale`, (count, 5), and size, (count,), of each superpixel."""
     sums = np.zeros((count, 6))
-    add_pixels(image.reshape(*labels.shape, -1), labels, np.float32(1), 0, len(labels), sums)
+    add_pixels(image.reshape(*labels.shape, -1), labels, np.float32(1), sums)
     if image.ndim == 2:
         sums[:, 1:3] = sums[:, :1]
     means = sums[:, :5] / sums[:, 5:]

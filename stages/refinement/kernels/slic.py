@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from stages.compiled.jit import fast_kernel, fast_part, kernel, part
-from stages.compiled.parallel import Fork, by_bands, in_turn, shared_by
+from stages.compiled.parallel import Fork, in_turn, shared_by
 from stages.compiled.union_find import join, root
 from stages.compiled.workspace import Workspaces
 from stages.data import Array
@@ -43,30 +43,22 @@ def superpixels(image: Array, count: int, threads: int = 1) -> tuple[Array, int]
     both = shared_by(threads)
     with _workspaces.one() as space:
         space.reserve(12 * height * width + 64)
-        colour = _colours(image, both)
+        colour = _colours(image)
         scale = 2 if min(height // grid[0], width // grid[1]) >= MIN_HALVED_CELL and min(height, width) > 1 else 1
-        small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]), both)
+        small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]))
         centres = _grid_centres(small, *grid)
         for _ in range(ITERATIONS):
             _move_centres(small, centres, grid, COMPACTNESS / step * scale, both)
         if scale == 2:
             centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
         labels = _labels(colour, centres, grid, COMPACTNESS / step, both)
-        total = connect(labels, min_size, space.array((3, height * width), np.int32), both)
+        total = int(connect(labels, min_size, space.array((3, height * width), np.int32)))
     return labels, total
 
 
-def _colours(image: Array, both: Fork = in_turn) -> Array:
+def _colours(image: Array) -> Array:
     """The image in CIELAB with 8 bits each, (H, W, 3) uint8; a gray one as it is, (H, W, 1)."""
-    if image.ndim == 2:
-        return image[..., None].copy()
-    colour = np.empty(image.shape, np.uint8)
-
-    def convert(first: int, end: int) -> None:
-        cv2.cvtColor(image[first:end], cv2.COLOR_RGB2LAB, dst=colour[first:end])
-
-    by_bands(both, len(image), convert)
-    return colour
+    return image[..., None].copy() if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2LAB)
 
 
 def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
@@ -83,13 +75,8 @@ def _grid_centres(colour: Array, rows: int, cols: int) -> Array:
 def _move_centres(colour: Array, centres: Array, grid: tuple[int, int], weight: float, both: Fork) -> None:
     """One k-means step: each centre becomes the mean of its pixels."""
     labels = _labels(colour, centres, grid, weight, both)
-    upper, lower = np.zeros((2, len(centres), 6))
-    middle = len(colour) // 2
-    both(
-        lambda: add_pixels(colour, labels, LIGHTNESS_SCALE, 0, middle, upper),
-        lambda: add_pixels(colour, labels, LIGHTNESS_SCALE, middle, len(colour), lower),
-    )
-    sums = upper + lower
+    sums = np.zeros((len(centres), 6))
+    add_pixels(colour, labels, LIGHTNESS_SCALE, sums)
     seen = sums[:, 5] > 0
     centres[seen] = sums[seen, :5] / sums[seen, 5:]
 
@@ -158,14 +145,14 @@ def _find_nearest(work, y, position_weight):
 
 
 @kernel
-def add_pixels(colour, labels, scale, first, end, sums):
-    """Add colour, y, x and 1 of the pixels of rows first to end to the `sums` of their labels, (n, 6) float64.
+def add_pixels(colour, labels, scale, sums):
+    """Add colour, y, x and 1 of each pixel to the `sums` of its label, (n, 6) float64.
 
     scale: of the first channel; of a gray image the second and third are not added.
     """
-    channels = colour.shape[2]
-    for y in range(first, end):
-        for x in range(colour.shape[1]):
+    height, width, channels = colour.shape
+    for y in range(height):
+        for x in range(width):
             total = sums[labels[y, x]]
             total[0] += F32(colour[y, x, 0]) * scale
             if channels == 3:
@@ -197,24 +184,42 @@ def _expand_row(centres, rows, cols, row, beside, position_weight, laid):
             laid[4, start:stop] = NO_CENTRE
 
 
-def connect(labels: Array, min_size: int, scratch: Array, both: Fork = in_turn) -> int:
+@kernel
+def connect(labels, min_size, scratch):
     """Number the 4-connected components of `labels` (H, W) int32 in scan order, in place; returns how many.
 
     scratch: (3, H * W) int32. A component of fewer than `min_size` pixels joins the one left of its first pixel, or
     above it at the left border.
     """
-    height = labels.shape[0]
     # For each run of equal labels in a row: its end, an earlier run of its component, and its component's number.
-    ends, parent, number = scratch
-    rows = np.empty((height, 2), np.int64)  # first run of each row, and one past the last
-    middle = height // 2
-    both(
-        lambda: _join_runs(labels, 0, middle, rows, ends, parent),
-        lambda: _join_runs(labels, middle, height, rows, ends, parent),
-    )
-    total = int(_number(labels, middle, min_size, rows, ends, parent, number))
-    by_bands(both, height, lambda first, end: _write(labels, first, end, rows, ends, parent, number))
+    ends, parent, number = scratch[0], scratch[1], scratch[2]
+    rows = np.empty((labels.shape[0], 2), np.int64)  # first run of each row, and one past the last
+    _join_runs(labels, rows, ends, parent)
+    total = _number(min_size, rows, ends, parent, number)
+    for y in range(labels.shape[0]):
+        start = 0
+        for run in range(rows[y, 0], rows[y, 1]):
+            of_all = number[parent[run]]
+            for x in range(start, ends[run]):
+                labels[y, x] = of_all
+            start = ends[run]
     return total
+
+
+@part
+def _join_runs(labels, rows, ends, parent):
+    """Find the runs and join those of a component."""
+    width, run = labels.shape[1], np.int64(0)
+    for y in range(labels.shape[0]):
+        rows[y, 0], row = run, labels[y]
+        for x in range(1, width):  # without a branch, which nothing predicts
+            ends[run], parent[run] = x, run
+            run += np.int64(row[x] != row[x - 1])
+        ends[run], parent[run] = width, run
+        run += 1
+        rows[y, 1] = run
+        if y > 0:
+            _join(labels, y, rows, ends, parent)
 
 
 @part
@@ -235,30 +240,10 @@ def _join(labels, y, rows, ends, parent):
             run_above += 1
 
 
-@kernel
-def _join_runs(labels, first, end, rows, ends, parent):
-    """Find the runs of rows first to end and join those of a component; they are numbered from first * W."""
-    width = labels.shape[1]
-    run = first * width
-    for y in range(first, end):
-        rows[y, 0], row = run, labels[y]
-        for x in range(1, width):  # without a branch, which nothing predicts
-            ends[run], parent[run] = x, run
-            run += np.int64(row[x] != row[x - 1])
-        ends[run], parent[run] = width, run
-        run += 1
-        rows[y, 1] = run
-        if y > first:
-            _join(labels, y, rows, ends, parent)
-
-
-@kernel
-def _number(labels, middle, min_size, rows, ends, parent, number):
+@part
+def _number(min_size, rows, ends, parent, number):
     """Set each run's parent to its root and number the components; returns their count."""
-    height = labels.shape[0]
-    if 0 < middle < height:
-        _join(labels, middle, rows, ends, parent)
-    for y in range(height):
+    for y in range(rows.shape[0]):
         start = 0
         for run in range(rows[y, 0], rows[y, 1]):
             first = root(parent, run)
@@ -268,7 +253,7 @@ def _number(labels, middle, min_size, rows, ends, parent, number):
             number[first] += ends[run] - start  # first the size
             start = ends[run]
     total = np.int32(0)
-    for y in range(height):  # a root is the first run of its component: earlier runs have their numbers
+    for y in range(rows.shape[0]):  # a root is the first run of its component: earlier runs have their numbers
         for run in range(rows[y, 0], rows[y, 1]):
             if parent[run] != run:
                 continue
@@ -279,17 +264,6 @@ def _number(labels, middle, min_size, rows, ends, parent, number):
                 number[run] = total
                 total += np.int32(1)
     return total
-
-
-@kernel
-def _write(labels, first, end, rows, ends, parent, number):
-    for y in range(first, end):
-        start = 0
-        for run in range(rows[y, 0], rows[y, 1]):
-            of_all = number[parent[run]]
-            for x in range(start, ends[run]):
-                labels[y, x] = of_all
-            start = ends[run]
 
 
 def assign_reference(colour: Array, centres: Array, rows: int, cols: int, position_weight: float) -> Array:

@@ -45,8 +45,7 @@ from stages.refinement.kernels.blocks import (
 )
 
 F32 = np.float32
-LEVELS = 3  # sizes of blocks: 4, 8 and 16 px
-RADIUS = 2  # blocks; windows of 5 x 5 blocks are 20, 40 and 80 px wide
+LEVELS = 3  # sizes of blocks: 4, 8 and 16 px; their windows are 20, 40 and 80 px wide
 CORRELATED = 100.0  # px, the area over which the errors of matches are alike
 EXCESS, EXACT = 1.95, 0.001  # of the errors over the bound; px^2, a variance at which half of its square is left
 SYSTEMATIC = 0.03  # px, of what no averaging removes
@@ -92,11 +91,11 @@ def supported(
     blocks = block_sums(pixels, guessed, left, slopes, information_scale(noise), LEVELS, both)
     blocks[VARIANCE, : variance.shape[0], : variance.shape[1]] = variance
     alike, matches = _correlated(blocks), blocks[N]
-    planes, size = [fit_windows(blocks, None, RADIUS, BLOCK, both)], BLOCK
+    planes, size = [fit_windows(blocks, None, BLOCK, both)], BLOCK
     for _ in range(1, LEVELS):
         blocks, start = coarser(blocks, planes[-1], size)
         size *= 2
-        planes.append(fit_windows(blocks, start, RADIUS, size, both))
+        planes.append(fit_windows(blocks, start, size, both))
     shrunk, spread = _shrunk(planes)
     result = Support(*(np.empty(pixels.shape, np.float32) for _ in Support._fields))
     given = pixels, guessed, matches, shrunk, variance, spread, alike, first_row

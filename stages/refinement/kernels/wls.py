@@ -14,7 +14,6 @@ from stages.compiled.jit import fast_kernel, kernel
 from stages.data import Array
 
 F32 = np.float32
-COLUMN_BLOCK = 320  # columns solved together; they fit the second-level cache
 PASSES = 3
 MIN_WEIGHT = F32(1e-6)  # smoothed weight; with less a pixel stays unknown
 
@@ -36,18 +35,10 @@ def smooth(values: Array, weights: Array, guide: Array, strength: float, sigma: 
     moment: Array = np.where(mass > 0, values, F32(0)) * mass
     for index in range(PASSES):
         step = F32(strength * 0.25**index)
-        moment, mass = cv2.transpose(moment), cv2.transpose(mass)
-        _solve_in_blocks(moment, mass, across, step)
-        moment, mass = cv2.transpose(moment), cv2.transpose(mass)
-        _solve_in_blocks(moment, mass, down, step)
+        for coupled in (across, down):
+            moment, mass = cv2.transpose(moment), cv2.transpose(mass)
+            _solve(moment, mass, coupled, step, np.empty(mass.shape, np.float32))
     return np.where(mass > MIN_WEIGHT, moment / np.maximum(mass, MIN_WEIGHT), F32(np.nan))
-
-
-def _solve_in_blocks(moment: Array, mass: Array, coupling: Array, strength: np.float32) -> None:
-    upper = np.empty((moment.shape[0], min(COLUMN_BLOCK, moment.shape[1])), np.float32)
-    for start in range(0, moment.shape[1], COLUMN_BLOCK):
-        stop = min(start + COLUMN_BLOCK, moment.shape[1])
-        _solve(moment, mass, coupling, strength, upper, start, stop)
 
 
 @kernel
@@ -60,16 +51,18 @@ def _couple(guide, coupling, out):
 
 
 @fast_kernel
-def _solve(moment, mass, coupling, strength, upper, start, stop):
-    """Solve (I + strength * A) u = f down every column of two right-hand sides, in place, by the Thomas algorithm."""
-    height = moment.shape[0]
-    n = stop - start
+def _solve(moment, mass, coupling, strength, upper):
+    """Solve (I + strength * A) u = f down every column of two right-hand sides, in place, by the Thomas algorithm.
+
+    upper: scratch of the same shape.
+    """
+    height, n = moment.shape
     for y in range(height):
-        f, g, c, above = moment[y, start:stop], mass[y, start:stop], upper[y, :n], coupling[y, start:stop]
-        below = coupling[min(y + 1, height - 1), start:stop]
+        f, g, c, above = moment[y, :n], mass[y, :n], upper[y, :n], coupling[y, :n]
+        below = coupling[min(y + 1, height - 1), :n]
         onward = strength if y + 1 < height else F32(0)
         before = max(y - 1, 0)
-        f_before, g_before, c_before = moment[before, start:stop], mass[before, start:stop], upper[before, :n]
+        f_before, g_before, c_before = moment[before, :n], mass[before, :n], upper[before, :n]
         if y == 0:
             for i in range(n):
                 b = onward * below[i]
@@ -85,8 +78,8 @@ def _solve(moment, mass, coupling, strength, upper, start, stop):
                 f[i] = (f[i] + a * f_before[i]) * scale
                 g[i] = (g[i] + a * g_before[i]) * scale
     for y in range(height - 2, -1, -1):
-        f, g, c = moment[y, start:stop], mass[y, start:stop], upper[y, :n]
-        f_after, g_after = moment[y + 1, start:stop], mass[y + 1, start:stop]
+        f, g, c = moment[y, :n], mass[y, :n], upper[y, :n]
+        f_after, g_after = moment[y + 1, :n], mass[y + 1, :n]
         for i in range(n):
             f[i] += c[i] * f_after[i]
             g[i] += c[i] * g_after[i]

@@ -56,7 +56,7 @@ def test_planes_equal_least_squares_over_the_matches_of_the_window(seed):
     blocks[kernel.VARIANCE] = np.random.default_rng(seed).uniform(0.01, 0.3, blocks.shape[1:])
     start = np.zeros((3, *blocks.shape[1:]), np.float32)
     start[kernel.A], start[kernel.B], start[kernel.C] = 0.04, 0.12, blocks[kernel.MEAN] + 0.1
-    found = kernel.fit_windows(blocks, start, 2, 4, ALONE)
+    found = kernel.fit_windows(blocks, start, 4, ALONE)
     y, x = np.nonzero(np.isfinite(pixels) & ~guessed)
     for j, i in ((0, 0), (3, 5), (7, 11)):
         within = (abs(y // 4 - j) <= 2) & (abs(x // 4 - i) <= 2)

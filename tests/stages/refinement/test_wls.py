@@ -27,15 +27,6 @@ def test_equals_a_sparse_solve_of_every_line(height, width, strength, heaviest, 
     assert np.isnan(smoothed[mass < 0.999 * MIN_WEIGHT]).all()
 
 
-def test_wide_images_are_solved_in_blocks_without_seams():
-    rng = np.random.default_rng(5)
-    values = rng.uniform(0, 100, (12, 700)).astype(np.float32)
-    guide = rng.integers(100, 110, values.shape, dtype=np.uint8)
-    weights = np.ones_like(values)
-    expected, _ = smooth_reference(values, weights, guide, 100, 3)
-    assert smooth(values, weights, guide, 100, 3) == pytest.approx(expected, abs=1e-3)
-
-
 def test_a_hole_takes_the_value_on_its_side_of_the_edge():
     guide = np.full((40, 60), 50, np.uint8)
     guide[:, 30:] = 200
