@@ -85,19 +85,17 @@ install()
 _njit: Any = njit  # whose published type lacks the options on wrappers
 # These release Python's lock and give inf or NaN for a division by 0. Without the entry points that nobody calls,
 # compiling takes a third less time.
-kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True)
-part: Any = _njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True)
+_CALLED: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+_INSIDE = _CALLED | {"no_cpython_wrapper": True}
+kernel: Any = _njit(cache=True, **_CALLED)
+part: Any = _njit(**_INSIDE)
 # `part`, inlined into its callers: arrays that it takes are not counted, which pays in an inner loop.
-inlined_part: Any = _njit(
-    nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True, forceinline=True
-)
+inlined_part: Any = _njit(forceinline=True, **_INSIDE)
 # The same for arithmetic without NaN and infinity, whose sums may be taken in any order; as deterministic.
-fast_kernel: Any = _njit(nogil=True, cache=True, error_model="numpy", no_cfunc_wrapper=True, fastmath=True)
+fast_kernel: Any = _njit(cache=True, fastmath=True, **_CALLED)
 # Inlined into its callers: of several compiled copies numba would use the first for all of them, and each copy may
 # take its sums in an order of its own.
-fast_part: Any = _njit(
-    nogil=True, error_model="numpy", no_cfunc_wrapper=True, no_cpython_wrapper=True, fastmath=True, forceinline=True
-)
+fast_part: Any = _njit(fastmath=True, forceinline=True, **_INSIDE)
 # `kernel` for functions with type annotations.
 typed_kernel: Callable[[Function], Function] = kernel
 # The same for functions that make no arrays: counting references to the caller's arrays, as numba does by default,

@@ -82,9 +82,7 @@ def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) 
     index = np.arange(inverse.size).reshape(inverse.shape)
     links = []
     for axis in (0, 1):
-        lines, numbers = (np.moveaxis(a, axis, 1) for a in (inverse, index))
-        allowed = np.moveaxis(tolerance, axis, 1)
-        for line, number, noise in zip(lines, numbers, allowed, strict=True):
+        for line, noise, number in zip(*(np.moveaxis(a, axis, 1) for a in (inverse, tolerance, index)), strict=True):
             at = np.flatnonzero(line > 0)
             near, far = at[:-1], at[1:]
             limit = np.maximum(noise[near], noise[far]) + slope * (far - near)
@@ -92,10 +90,8 @@ def connected_patches_reference(inverse: Array, tolerance: Array, slope: float) 
             links.append(np.stack([number[near[linked]], number[far[linked]]]))
     one, other = np.concatenate(links, axis=1)
     graph = coo_array((np.ones(len(one)), (one, other)), shape=(inverse.size, inverse.size))
-    label = connected_components(graph, directed=False)[1]
-    first, label, sizes = np.unique(label[present.ravel()], return_index=True, return_inverse=True, return_counts=True)[
-        1:
-    ]
+    found = connected_components(graph, directed=False)[1].reshape(inverse.shape)[present]
+    _, first, label, sizes = np.unique(found, return_index=True, return_inverse=True, return_counts=True)
     patch = np.full(inverse.shape, -1, np.int32)
     patch[present] = np.argsort(np.argsort(first))[label]
     return patch, sizes[np.argsort(first)].astype(np.int32)
