@@ -208,7 +208,8 @@ class Interpolate(_Sampler):
         if wide:
             limit = f"{_time(max_gap)} ({state.name}.max_gap)"
             return f"{state.stream} has a gap of {_time(after.stamp - before.stamp)}, more than {limit}"
-        near = self._near(state.samples, stamp)
+        width = min(self.smooth, stamp - state.samples[0].stamp, state.samples[-1].stamp - stamp)  # equal on both sides
+        near = [sample.value for sample in state.samples if abs(sample.stamp - stamp) <= width]
         if len(near) >= MIN_SMOOTHING_SAMPLES:
             return before.value.smoothed(near, stamp)
         return before.value.interpolated(after.value, stamp)
@@ -220,13 +221,6 @@ class Interpolate(_Sampler):
         if len(intervals) < MIN_INTERVALS:
             return MIN_GAP_OF_UNKNOWN_INTERVAL
         return max(MIN_GAP, round(GAP_INTERVALS * median_low(intervals)))
-
-    def _near(self, samples: deque[Token], stamp: int) -> list[Any]:
-        """The samples within `smooth` of the stamp, equally far to both sides."""
-        if not self.smooth:
-            return []
-        width = min(self.smooth, stamp - samples[0].stamp, samples[-1].stamp - stamp)
-        return [sample.value for sample in samples if abs(sample.stamp - stamp) <= width]
 
 
 @dataclass(frozen=True)
