@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections import Counter
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,17 +42,12 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
         raise UsageError(f"{options.folder} is not empty; choose another folder, because maps of two runs must not mix")
-    lost, made = Counter[str](), not options.folder.exists()
+    lost = Counter[str]()
     try:
         with writing(options.folder):
             files, faults = _written(options, results, lost)
     except BaseException:  # a partial export looks like a whole one, and blocks the next attempt
-        for part in [options.folder] if made else list(options.folder.iterdir()):
-            if part.is_dir():
-                shutil.rmtree(part, ignore_errors=True)
-            else:
-                with suppress(OSError):  # the reason for the failure is the one to report
-                    part.unlink()
+        shutil.rmtree(options.folder, ignore_errors=True)  # the reason for the failure is the one to report
         raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
