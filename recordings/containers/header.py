@@ -8,19 +8,26 @@ import struct
 import zstandard
 
 from recordings.containers.container import Channel
-from recordings.ros2.cdr import plain
+from recordings.ros2.cdr import plain, standard_types
 
 _STAMP_END = 12  # bytes of a message up to the end of its header's stamp
-_HEADER_FIRST = re.compile(rb"\A(?:\s*(?:#[^\n]*)?\n)*\s*(?:std_msgs/(?:msg/)?)?Header\s+header\b")
+# The time of Foxglove's messages is in the same place.
+_HEADER_FIRST = re.compile(
+    rb"\A(?:\s*(?:#[^\n]*)?\n)*\s*"
+    rb"(?:(?:std_msgs/(?:msg/)?)?Header\s+header|(?:builtin_interfaces/(?:msg/)?)?Time\s+timestamp)\b"
+)
 _HEADER_FIRST_IDL = re.compile(rb"struct \w+ \{\s*(?:@[^\n]*\n\s*)*std_msgs::msg::Header_?\s+header\b")
 
 
 def begins_with_header(channel: Channel) -> bool:
-    """Whether the schema of a channel says that its messages begin with a std_msgs/Header."""
-    if channel.schema is None or channel.message_encoding not in ("cdr", "ros1"):
+    """Whether the schema of a channel says that its messages begin with a std_msgs/Header, or with a time."""
+    schema = channel.schema
+    if schema is None or channel.message_encoding not in ("cdr", "ros1"):
         return False
-    pattern = _HEADER_FIRST_IDL.search if channel.schema.encoding == "ros2idl" else _HEADER_FIRST.match
-    return pattern(channel.schema.text[:100_000].replace(b"\r\n", b"\n")) is not None
+    if not schema.text.strip() and schema.name in standard_types().types:
+        return "header" in [name for name, _ in standard_types().fielddefs[schema.name][1][:1]]
+    pattern = _HEADER_FIRST_IDL.search if schema.encoding == "ros2idl" else _HEADER_FIRST.match
+    return pattern(schema.text[:100_000].replace(b"\r\n", b"\n")) is not None
 
 
 def peek_stamp(data: bytes | memoryview, message_encoding: str = "cdr") -> int:

@@ -18,7 +18,6 @@ from recordings.containers.container import LostMessage, MessageSchema, RawMessa
 from recordings.containers.header import peek_stamp
 from recordings.containers.recording import Recording
 from recordings.containers.time_range import MAX_LATENESS_NS
-from recordings.discovery.roles import BARE_TILT, IMAGES, POSES, TILTS
 from recordings.encodings.decoding import MAX_SCHEMA_BYTES, Decoder, decoder_of, weight_of
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import Unpacking
@@ -26,7 +25,6 @@ from recordings.ros2.from_msg import frame_of, stamp_of
 from recordings.video.decoder import PixelReader, VideoDecoder, begins_video, reader_of
 
 MAX_CHANNELS = 1000  # that are decoded; a rover has a tenth of it
-STAMPED_SCHEMAS = {*IMAGES, *TILTS, *POSES, BARE_TILT} - {"geometry_msgs/msg/Quaternion"}  # begin with a header
 _RATE_SECONDS = 10  # over which the rate of a topic is a mean, as recorders write late messages in bursts
 _SAMPLE_PLACES = 4  # parts of a log with samples each, because a sensor may begin with invalid messages
 _MAX_SAMPLES = 20  # messages of each part
@@ -128,17 +126,15 @@ class DecodedTopics:
         """The header stamp of a message, ns; 0 if there is none."""
         channel = self.file.channels[raw.channel]
         if channel.message_encoding in ("cdr", "ros1"):
-            stamped = raw.channel in self.file.stamped or self.schemas.get(channel.topic) in STAMPED_SCHEMAS
-            return peek_stamp(raw.data, channel.message_encoding) if stamped else 0
+            return peek_stamp(raw.data, channel.message_encoding) if raw.channel in self.file.stamped else 0
         stamp = attempt(lambda: stamp_of(self.decoders[raw.channel](raw.data).header))
         return 0 if isinstance(stamp, LogError) else stamp
 
     def ahead_of(self, topic: str) -> int:
         """How far the last stamp of a topic is ahead of its log time, ns, where they are of two clocks; else 0."""
         if topic not in self._ahead:
-            stamped = self.schemas.get(topic) in STAMPED_SCHEMAS
-            times = self.file.times(self.channels_of(topic)) if stamped else np.zeros(0, np.int64)
-            raws = self.file.messages(self.channels_of(topic), int(np.max(times))) if len(times) else iter(())
+            times = self.file.times(self.channels_of(topic))
+            raws = self.file.messages(self.channels_of(topic), max(times[-1:], default=None))
             last = next((raw for raw in raws if isinstance(raw, RawMessage)), None)
             stamp = self.stamp_of(last) if last is not None else 0
             ahead = stamp - last.log_time if last is not None and stamp else 0
@@ -147,9 +143,8 @@ class DecodedTopics:
 
     def is_unstamped(self, topic: str) -> bool:
         """Whether the header stamps of a topic are 0 and not those of a clock that begins there."""
-        raws = (raw for raw in self.file.messages(self.channels_of(topic)) if isinstance(raw, RawMessage))
-        first = next(raws, None) if self.schemas[topic] in STAMPED_SCHEMAS else None
-        return first is not None and len(first.data) >= 12 and not (self.stamp_of(first) or self.ahead_of(topic))
+        first = next(self.each(topic, lambda message: stamp_of(message.header)), None)
+        return first == 0 and not self.ahead_of(topic)
 
     def each(
         self, topic: str, make: Callable[[Any], T], start: int | None = None, allow_repeats: bool = False
@@ -170,7 +165,7 @@ class DecodedTopics:
 
     def last(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
         """Convert the messages of a topic at its last log time."""
-        return self.each(topic, make, max(self.file.times(self.channels_of(topic)).tolist(), default=None))
+        return self.each(topic, make, max(self.file.times(self.channels_of(topic))[-1:], default=None))
 
     def first(self, topic: str, make: Callable[[Any], T]) -> T | LogError:
         """Convert the first message, or the first of a sample for which this succeeds; otherwise the LogError."""

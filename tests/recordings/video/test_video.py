@@ -39,6 +39,8 @@ def test_images_from_video_are_those_that_were_encoded(sample, whole, tmp_path, 
         assert np.abs(one.pixels.astype(int) - gray_of(other.pixels)).max() <= 4
     with McapSource().open(log) as opened:
         assert "the images are compressed video" in opened.notes()["left"]
+        raws = opened.file.messages(opened.channels("right"))
+        assert [opened.stamp_of(raw, "right") for raw in raws] == [image.stamp for image in given]
 
 
 @pytest.mark.parametrize("video", FORMATS)
