@@ -14,7 +14,7 @@ from recordings.containers.container import LostMessage
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
-from tests.recordings.sample_log import LEFT
+from tests.recordings.sample_log import INFOS, LEFT, RIGHT, TILT, essences, items_of
 
 
 @pytest.fixture
@@ -54,6 +54,13 @@ def test_a_database_is_not_written_to_and_keeps_its_definitions(database, sample
     assert schema.text.startswith(b"std_msgs/Header header")
     assert read(database) == (without_types(rows_of(sample)), [])
     assert (sorted(database.parent.iterdir()), database.read_bytes()) == before
+
+
+def test_a_database_without_definitions_has_those_of_the_standard_types(database, whole):
+    edit(database, "DELETE FROM message_definitions")
+    assert essences(items_of(database)) == essences(whole)
+    with open_recording(database) as log:
+        assert {log.channels[number].topic for number in log.stamped} == {LEFT, RIGHT, TILT, "/odom", *INFOS}
 
 
 def test_a_broken_row_loses_itself(database, sample):
