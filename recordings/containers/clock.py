@@ -153,15 +153,14 @@ def _spread(times: NDArray[np.int64]) -> float:
     return float(gaps.std() / gaps.mean()) if len(gaps) > 1 and gaps.mean() > 0 else 0.0
 
 
-def split(steps: list[ClockStep], first: int, size: int) -> list[tuple[range, ClockStep]]:
-    """The stretches of a file between steps, as places in the file, each with the step before it.
-
-    first: the place of the file's first message; size: the number of its messages.
-    """
-    parts, begun = list[tuple[range, ClockStep]](), ClockStep(0, 0, 0, 0)
-    for step in [*steps, ClockStep(first + size, 0, 0, 0)]:
-        low, high = max(begun.place, first), min(step.place, first + size)
-        if high > low:
-            parts.append((range(low - first, high - first), begun))
-        begun = step
-    return parts or [(range(size), ClockStep(0, 0, 0, 0))]
+def corrected(timeline: Timeline, steps: list[ClockStep]) -> tuple[Timeline, NDArray[np.bool_]]:
+    """The timeline with corrected log times, and which of its messages have times that repeat."""
+    repeated = np.zeros(len(timeline), bool)
+    if not steps:
+        return timeline, repeated
+    times = timeline.log_times.copy()
+    for step, end in zip(steps, [*(step.place for step in steps[1:]), len(timeline)], strict=True):
+        part = times[step.place : end]
+        repeated[step.place : end] = (part >= 0) & (part < step.repeats_until)
+        part[part >= 0] += step.shift
+    return Timeline(timeline.channels, times), repeated

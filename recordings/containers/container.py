@@ -6,7 +6,7 @@ To read another format, write a subclass of `Container` and name it in `opening.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import dataclass
 from heapq import merge
 from operator import attrgetter
@@ -83,22 +83,20 @@ class Container(ABC):
     indexed: bool
 
     def messages(
-        self, channels: set[int], start: int | None = None, end: int | None = None, places: range | None = None
+        self, channels: set[int], start: int | None = None, end: int | None = None
     ) -> Iterator[RawMessage | LostMessage]:
         """The messages of `channels` with start <= log time < end, ns, in log-time order (ties: in file order).
 
-        A `LostMessage` stands at the log time of lost messages; if that time is unknown, at the end. places: of the
-        messages in the timeline; None: all.
+        A `LostMessage` stands at the log time of lost messages; if that time is unknown, at the end.
         """
-        timeline, low, high = self.timeline, start or 0, 1 << 64 if end is None else end
-        found = self._read(timeline.chosen(channels, start, end, places))
-        lost = list[LostMessage]()
-        if places is None or places.stop >= len(timeline):
-            why = "the message is lost: its log time is damaged"
-            untimed = timeline.channels[timeline.log_times < 0].tolist()
-            lost = [LostMessage(channel, self.end, why) for channel in untimed if channel in channels]
-            lost = sorted((item for item in self.lost + lost if low <= item.log_time < high), key=_time_of)
-        return merge(found, lost, key=_time_of) if lost else found
+        found = self.read(self.timeline.chosen(channels, start, end))
+        lost = within(self.losses(channels), start, end)
+        return merge(found, lost, key=log_time_of) if lost else found
+
+    def losses(self, channels: set[int]) -> list[LostMessage]:
+        """The damage, and the messages of some channels whose log time is damaged."""
+        why, untimed = "the message is lost: its log time is damaged", self.timeline.untimed
+        return self.lost + [LostMessage(channel, self.end, why) for channel in untimed if channel in channels]
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """At least the first bytes of the messages of `channels`, with their headers, in any order and not verified."""
@@ -113,7 +111,7 @@ class Container(ABC):
         """Close the file."""
 
     @abstractmethod
-    def _read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
+    def read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
         """The messages at some places of the timeline, in that order."""
 
     def _ends(self, why: str = "") -> tuple[int, int]:
@@ -125,7 +123,13 @@ class Container(ABC):
         return int(np.min(times)), int(np.max(times))
 
 
-_time_of = attrgetter("log_time")
+log_time_of = attrgetter("log_time")
+
+
+def within(lost: Iterable[LostMessage], start: int | None, end: int | None) -> list[LostMessage]:
+    """The losses with start <= log time < end, ns, by log time."""
+    high = 1 << 64 if end is None else end
+    return sorted((item for item in lost if (start or 0) <= item.log_time < high), key=log_time_of)
 
 
 def blocks(places: Places) -> Iterator[Places]:

@@ -67,9 +67,9 @@ class Db3File(Container):
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """The first bytes of the messages of some channels, with their headers."""
-        return chain(self._read(self.timeline.places_of(channels), HEAD_BYTES), self.lost)
+        return chain(self.read(self.timeline.places_of(channels), HEAD_BYTES), self.lost)
 
-    def _read(self, places: Places, size: int = MAX_STORED_BYTES) -> Iterator[RawMessage | LostMessage]:
+    def read(self, places: Places, size: int = MAX_STORED_BYTES) -> Iterator[RawMessage | LostMessage]:
         """The first `size` bytes of the messages at some places of the timeline."""
         for block in blocks(places):
             wanted = self.timeline.channels, self.timeline.log_times, self._rows[0]

@@ -1,16 +1,18 @@
 """One log: the messages of one or several files, merged in the order of log time.
 
-Where the recorder's clock was set, a file is read as two parts, each with its own correction of the log times. Files
-and parts are opened when their time comes, so memory does not grow with their number.
+Their timelines are one, in which log times are corrected where the recorder's clock was set. A file is read when its
+messages are due, so memory does not grow with the number of files.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
-from heapq import heapify, heappop, heappush
+from heapq import merge
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +20,20 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from recordings.containers.clock import ClockStep, clock_steps, split
-from recordings.containers.container import Channel, Container, LostMessage, RawMessage
+from recordings.containers.clock import ClockStep, clock_steps, corrected
+from recordings.containers.container import (
+    Channel,
+    Container,
+    LostMessage,
+    RawMessage,
+    blocks,
+    log_time_of,
+    within,
+)
 from recordings.containers.header import begins_with_header, peek_stamp
 from recordings.containers.timeline import Places, Timeline
 
 _MAX_REMEMBERED = 32  # messages of a topic, to leave out those that were recorded twice
-
 
 Numbers = Mapping[int, int]  # number of a channel in a file -> number in the recording
 
@@ -50,60 +59,6 @@ def _merged_channels(files: Sequence[Container]) -> tuple[dict[int, Channel], li
             taken.add(free)
         numbers.append(own)
     return merged, numbers
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A stretch of a file between two steps of the recorder's clock. places: in the file."""
-
-    file: Container
-    numbers: Numbers
-    places: range
-    step: ClockStep
-
-    @property
-    def whole(self) -> bool:
-        return len(self.places) == len(self.file.timeline)
-
-    @cached_property
-    def ends(self) -> tuple[int, int]:
-        """No message of the part is earlier than the first log time, and none later than the last, ns."""
-        start, end = self.file.start, self.file.end
-        if not self.whole:
-            times = self.file.timeline.log_times[self.places.start : self.places.stop]
-            start, end = int(np.min(times[times >= 0], initial=end)), int(np.max(times, initial=start))
-        return start + self.step.shift, end + self.step.shift
-
-    def times(self, channels: set[int], allow_repeats: bool) -> NDArray[np.int64]:
-        """The log times of some channels of the recording, ns, in any order."""
-        known = self.file.timeline.by_channel
-        inside = (self._inside(known[channel]) for channel in _of_file(self.numbers, channels) & known.keys())
-        times = np.concatenate([np.zeros(0, np.int64), *(self.file.timeline.log_times[places] for places in inside)])
-        if self.step.repeats_until and not allow_repeats:
-            times = times[times >= self.step.repeats_until]
-        times += self.step.shift
-        return times
-
-    def _inside(self, places: Places) -> Places:
-        """Those of some sorted places that are in the part."""
-        first, last = np.searchsorted(places, [self.places.start, self.places.stop])
-        return places[first:last]
-
-    def messages(
-        self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
-    ) -> Iterator[RawMessage | LostMessage]:
-        """The messages of some channels of the recording, in log-time order."""
-        own = _of_file(self.numbers, channels)
-        low, high = (None if time is None else max(time - self.step.shift, 0) for time in (start, end))
-        for item in self.file.messages(own, low, high, None if self.whole else self.places):
-            channel = None if item.channel is None else self.numbers[item.channel]
-            log_time = item.log_time + self.step.shift
-            if isinstance(item, LostMessage):
-                yield LostMessage(channel, log_time, item.reason)
-            elif item.log_time < self.step.repeats_until and not allow_repeats:
-                yield LostMessage(channel, log_time, _repeated(self.step))
-            elif channel is not None:
-                yield RawMessage(channel, log_time, item.data)
 
 
 def _repeated(step: ClockStep) -> str:
@@ -136,9 +91,13 @@ class Recording:
         self.size = sum(file.size for file in files)
         self.channels, self._numbers = _merged_channels(files)
         self.stamped = {number for number, channel in self.channels.items() if begins_with_header(channel)}
+        self._firsts = np.cumsum([0, *(len(file.timeline) for file in files)])  # the places at which files begin
         try:
-            self.start = min(part.ends[0] for part in self._parts)
-            self.end = max(part.ends[1] for part in self._parts)
+            stored = self._stored_timeline()
+            self._steps = clock_steps(stored, self.stamped, self._stamp_at)
+            self._timeline, self._repeated = corrected(stored, self._steps)
+            times = self._timeline.log_times[self._timeline.log_times >= 0]
+            self.start, self.end = int(np.min(times)), int(np.max(times))
         except BaseException:
             self.close()
             raise
@@ -146,14 +105,12 @@ class Recording:
     @property
     def lost(self) -> list[LostMessage]:
         """The damage found so far."""
-        found = ((file, item) for file in self.files for item in file.lost)
-        gone = [LostMessage(None, self.end, why) for why in self._missing]
-        return gone + [LostMessage(None, item.log_time, self._named(file, item.reason)) for file, item in found]
+        return self._losses(set())
 
     @property
     def notes(self) -> list[str]:
         """Sentences: that the path is only a part, and that log times are corrected."""
-        shifts = {part.step.shift for part in self._parts} - {0}
+        shifts = {step.shift for step in self._steps} - {0}
         remedy = "and its log times are corrected by header stamps"
         corrected = [f"the recorder's clock was set back by {shift / 1e9:.3g} s, {remedy}" for shift in sorted(shifts)]
         return [*filter(None, [self.part]), *corrected]
@@ -201,23 +158,35 @@ class Recording:
     def _merged(
         self, channels: set[int], start: int | None, end: int | None, allow_repeats: bool
     ) -> Iterator[RawMessage | LostMessage]:
-        """The messages of all parts, in log-time order."""
-        begun = list[Iterator[RawMessage | LostMessage] | None]([None] * len(self._parts))
-        queue: list[tuple[int, int, Any]] = [(part.ends[0], number, None) for number, part in enumerate(self._parts)]
-        heapify(queue)
-        while queue:
-            log_time, number, item = heappop(queue)
-            if end is not None and log_time >= end and item is None:
-                continue
-            if item is not None:
-                yield item
-            items = begun[number]
-            if items is None:
-                items = begun[number] = self._read(self._parts[number], channels, start, end, allow_repeats)
-            if (following := next(items, None)) is not None:
-                heappush(queue, (following.log_time, number, following))
-        if end is None:
-            yield from (LostMessage(None, self.end, why) for why in self._missing)
+        """The messages of all files, in log-time order."""
+        lost = within(self._losses(channels), start, end)
+        found = self._read(self._timeline.chosen(channels, start, end), allow_repeats)
+        return merge(found, lost, key=log_time_of) if lost else found
+
+    def _losses(self, channels: set[int]) -> list[LostMessage]:
+        """The damage, and the messages of some channels whose log time is damaged."""
+        lost = [LostMessage(None, self.end, why) for why in self._missing]
+        for file, numbers in zip(self.files, self._numbers, strict=True):
+            lost += [self._of_recording(file, numbers, item) for item in file.losses(_of_file(numbers, channels))]
+        return lost
+
+    def _read(self, places: Places, allow_repeats: bool) -> Iterator[RawMessage | LostMessage]:
+        """The messages at some places, in that order."""
+        of_file = np.searchsorted(self._firsts, places, "right") - 1
+        readers = [
+            file.read(places[of_file == number] - self._firsts[number]) for number, file in enumerate(self.files)
+        ]
+        if len(readers) == 1 and not self._steps:
+            yield from readers[0]
+            return
+        for block, numbers in zip(blocks(places), blocks(of_file), strict=True):
+            times, repeated = self._timeline.log_times[block].tolist(), self._repeated[block].tolist()
+            for place, number, time, repeats in zip(block.tolist(), numbers.tolist(), times, repeated, strict=True):
+                item = self._of_recording(self.files[number], self._numbers[number], next(readers[number]))
+                if repeats and not allow_repeats:
+                    step = self._steps[bisect_right(self._steps, place, key=attrgetter("place")) - 1]
+                    item = LostMessage(item.channel, time, _repeated(step))
+                yield item._replace(log_time=time)
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """At least the first bytes of some messages, with their headers, in any order and not verified.
@@ -230,18 +199,16 @@ class Recording:
         for file, numbers in zip(self.files, self._numbers, strict=True):
             own = _of_file(numbers, channels)
             for item in file.heads(own) if own else ():
-                yield item if item.channel is None else item._replace(channel=numbers[item.channel])
+                yield self._of_recording(file, numbers, item)
 
     def times(self, channels: set[int], allow_repeats: bool = False) -> NDArray[np.int64]:
         """The sorted log times of some channels, ns; by default without those that repeat."""
-        times = np.concatenate([part.times(channels, allow_repeats) for part in self._parts])
-        times.sort()
-        return times
+        places = self._timeline.places_of(channels)
+        return np.sort(self._timeline.log_times[places if allow_repeats else places[~self._repeated[places]]])
 
     def count(self, channels: set[int]) -> int:
         """The number of messages in some channels."""
-        found = zip(self.files, self._numbers, strict=True)
-        return sum(file.count(_of_file(numbers, channels)) for file, numbers in found)
+        return self._timeline.count(channels)
 
     def close(self) -> None:
         """Close the files."""
@@ -253,55 +220,35 @@ class Recording:
     def __exit__(self, *raised: object) -> None:
         self.close()
 
-    def _named(self, file: Container, reason: str) -> str:
-        return f"{file.path.name}: {reason}" if len(self.files) > 1 else reason
+    def _of_recording(self, file: Container, numbers: Numbers, item: Any) -> Any:
+        """A message of a file with the number of its channel in the recording; a loss names the file."""
+        channel = None if item.channel is None else numbers[item.channel]
+        if isinstance(item, LostMessage):
+            named = f"{file.path.name}: {item.reason}" if len(self.files) > 1 else item.reason
+            return LostMessage(channel, item.log_time, named)
+        return item._replace(channel=channel)
 
-    def _read(self, part: _Part, *which: Any) -> Iterator[RawMessage | LostMessage]:
-        for item in part.messages(*which):
-            if isinstance(item, LostMessage):
-                item = item._replace(reason=self._named(part.file, item.reason))
-            yield item
+    def _stored_timeline(self) -> Timeline:
+        """The timeline of all files, as the recorder's clock had it.
 
-    @cached_property
-    def _parts(self) -> list[_Part]:
-        """The parts of all files, in the order in which they were recorded."""
-        parts, first = list[_Part](), 0
-        steps = self._steps()
-        for file, numbers in zip(self.files, self._numbers, strict=True):
-            size = len(file.timeline)
-            for places, step in split(steps, first, size):
-                parts.append(_Part(file, numbers, places, step))
-            first += size
-        return parts
-
-    def _steps(self) -> list[ClockStep]:
-        """The steps of the recorder's clock over all files; their places are counted through the files.
-
-        They are judged by channel: two channels of a topic, such as results beside inputs, are stored independently.
+        Two channels of a topic, such as results beside inputs, are stored independently and stay two.
         """
         timelines = [file.timeline for file in self.files]
-        firsts = [0, *np.cumsum([len(timeline) for timeline in timelines]).tolist()]  # places in the recording
-
-        def stamp_at(place: int) -> int:
-            number = int(np.searchsorted(firsts, place, side="right")) - 1
-            return _stamp_at(self.files[number], place - firsts[number])
-
-        if len(self.files) == 1:
-            return clock_steps(timelines[0], self.stamped, stamp_at)
+        if len(timelines) == 1:
+            return timelines[0]
         channels = list[NDArray[np.int32]]()
         for numbers, timeline in zip(self._numbers, timelines, strict=True):
             merged_of = np.full(np.max(timeline.channels, initial=0) + 1, -1, np.int32)  # -1: of no known channel
             for own, number in numbers.items():
                 merged_of[own : own + 1] = number
             channels.append(merged_of[timeline.channels])
-        merged = Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
-        return clock_steps(merged, self.stamped, stamp_at)
+        return Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
 
-
-def _stamp_at(file: Container, place: int) -> int:
-    """The header stamp of the message at a place of a file; 0 if a damaged index gives it another log time."""
-    channel = int(file.timeline.channels[place])
-    for item in file.messages({channel}, places=range(place, place + 1)):
-        if isinstance(item, RawMessage) and item.log_time == file.timeline.log_times[place]:
-            return peek_stamp(item.data, file.channels[channel].message_encoding)
-    return 0
+    def _stamp_at(self, place: int) -> int:
+        """The header stamp of the message at a place; 0 if a damaged index gives it another log time."""
+        number = int(np.searchsorted(self._firsts, place, "right")) - 1
+        file, place = self.files[number], place - int(self._firsts[number])
+        item = next(file.read(np.array([place])))
+        if isinstance(item, LostMessage) or item.log_time != file.timeline.log_times[place]:
+            return 0
+        return peek_stamp(item.data, file.channels[item.channel].message_encoding)

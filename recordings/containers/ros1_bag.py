@@ -66,7 +66,7 @@ class Ros1Bag(Container):
             self.close()
             raise
 
-    def _read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
+    def read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
         """The messages at some places of the timeline."""
         timeline, (of_chunk, _, entries) = self.timeline, self._bag.entries
         opened = OpenChunks(of_chunk[places], lambda number: self._unpacked(self._bag.places[number]))

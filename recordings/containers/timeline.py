@@ -45,6 +45,11 @@ class Timeline:
         return {int(self.channels[places[0]]): places for places in parts if len(places)}
 
     @cached_property
+    def untimed(self) -> list[int]:
+        """The channels of the messages with a damaged log time."""
+        return [int(channel) for channel in self.channels[self.log_times < 0]]
+
+    @cached_property
     def _counts(self) -> dict[int, int]:
         channels, counts = np.unique(self.channels, return_counts=True)
         return dict(zip(channels.tolist(), counts.tolist(), strict=True))
@@ -62,14 +67,9 @@ class Timeline:
         places = [self.by_channel[channel] for channel in sorted(channels & self.by_channel.keys())]
         return np.sort(np.concatenate([np.zeros(0, np.int64), *places]))
 
-    def chosen(self, channels: set[int], start: int | None, end: int | None, places: range | None) -> Places:
-        """The places of the messages of some channels with start <= log time < end, ns, by log time.
-
-        places: those that count; None: all.
-        """
+    def chosen(self, channels: set[int], start: int | None, end: int | None) -> Places:
+        """The places of the messages of some channels with start <= log time < end, ns, by log time."""
         found = self.places_of(channels)
-        if places is not None:
-            found = found[slice(*np.searchsorted(found, [places.start, places.stop]))]
         times = self.log_times[found]
         found = found[(times >= (start or 0)) & (times < (MAX_LOG_TIME + 1 if end is None else end))]
         return found[np.argsort(self.log_times[found], kind="stable")]

@@ -119,7 +119,7 @@ class McapFile(Container):
             try:
                 yield from list(self._chunk_heads(chunk, inside) if len(inside) else ())
             except PARSE_ERRORS:
-                yield from self._read(chunk.places.start + inside)
+                yield from self.read(chunk.places.start + inside)
         yield from self.lost
 
     def _chunk_heads(self, chunk: StoredChunk, inside: NDArray[np.intp]) -> Iterator[RawMessage]:
@@ -152,7 +152,7 @@ class McapFile(Container):
         described = MessageSchema(schema.name, schema.encoding, schema.data) if schema else None
         return Channel(number, channel.topic, channel.message_encoding, described)
 
-    def _read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
+    def read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
         """The messages at some places of the timeline."""
         timeline, chunks = self.timeline, self.index.chunks
         of_chunk = np.searchsorted([chunk.places.start for chunk in chunks], places, "right") - 1

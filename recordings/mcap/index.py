@@ -79,15 +79,11 @@ class Index:
     unpacked: int = 0
     latest: int = 0
 
-    def add(
-        self,
-        offset: int,
-        length: int,
-        channels: array[int] | NDArray[Any],
-        times: array[int] | NDArray[Any],
-        **kind: Any,
-    ) -> None:
-        """Add the next messages of the file, in a chunk or outside; kind: fields of `StoredChunk`."""
+    def add(self, offset: int, length: int, channels: Any, times: Any, **kind: Any) -> None:
+        """Add the next messages of the file, in a chunk or outside.
+
+        channels, times: arrays of 16 and 64 bits; kind: fields of `StoredChunk`.
+        """
         first, times = len(self.message_times), np.asarray(times, np.uint64)
         self.message_channels.frombytes(channels.tobytes())
         self.message_times.frombytes(times.tobytes())

@@ -9,7 +9,7 @@ import fcntl
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
-from itertools import groupby, takewhile
+from itertools import groupby
 from operator import attrgetter
 from os.path import samestat
 from pathlib import Path
@@ -44,9 +44,9 @@ class ResumableWriter(Ros2Writer):
             topics = {channel.topic: log.channels_of([channel.topic]) for channel in log.channels.values()}
             self.contained = {topic: set(log.times(channels).tolist()) for topic, channels in topics.items()}
             self._channels_before = log.channels
-            checked = [chunk.places.stop for chunk in takewhile(lambda chunk: not chunk.is_cut, log.index.chunks)]
-            checked_messages = log.messages(set(log.channels), places=range(max(checked, default=0)))
-            self._groups = groupby(checked_messages, attrgetter("log_time"))
+            cut = next((chunk.places.start for chunk in log.index.chunks if chunk.is_cut), len(log.timeline))
+            places = log.timeline.chosen(set(log.channels), None, None)
+            self._groups = groupby(log.read(places[places < cut]), attrgetter("log_time"))  # a CRC covers each
 
     def skip(self, topic: str, stamp: int) -> bool:
         """Copy a message of the unfinished log; False if it is not there. The stamps must ascend."""
