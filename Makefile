@@ -26,6 +26,7 @@ fuzz: $(READY)
 
 study: $(READY)
 	$(BIN)/python -m tests.study demo/study
+	$(BIN)/python -m tests.error_against_time demo/study
 
 pictures: $(READY)
 	$(BIN)/python -m tests.pictures docs
