@@ -307,6 +307,13 @@ def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
     assert not list(tmp_path.glob("*.partial"))
 
 
+def test_a_pipeline_of_nested_aliases_is_refused_at_once(tmp_path, refused):
+    lines = [f"a0: &a0 {['x'] * 9}", *(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10))]
+    (tmp_path / "bomb.yaml").write_text("\n".join(lines))
+    why = refused("graph", "-p", tmp_path / "bomb.yaml")
+    assert "bomb.yaml:1: too large after expanding YAML aliases (limit: 100000 values)" in why
+
+
 @pytest.mark.parametrize(("command", "usage", "name", "remedy"), [
     ("rnu a.mcap", "", "argument COMMAND: invalid choice: 'rnu'", "did you mean 'run'?"),
     ("frobnicate", "", "argument COMMAND: invalid choice: 'frobnicate' (choose from", ")"),

@@ -17,7 +17,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from flow.cli.report import say
+from flow.errors import UsageError
 
+PORT, WEB_PORT = 9877, 9090  # the first ones tried, on loopback; the viewer itself listens on 9876
 LIVE_MEMORY = "512MB"  # of what a browser that comes later still gets; beyond it the oldest is dropped
 
 
@@ -31,7 +33,7 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
     if not (view or serve):
         yield 0
         return
-    port, web = _free_port(), _free_port()
+    port, web = _free(PORT), _free(WEB_PORT)
     page = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(web), "--server-memory-limit", LIVE_MEMORY]
     words = [*page, "--port", str(port)] if serve else ["--port", "auto"]
     reading, writing = os.pipe()
@@ -63,8 +65,14 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
             reporter.join()
 
 
-def _free_port() -> int:
-    """A port of loopback that nobody uses."""
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return int(found.getsockname()[1])
+def _free(first: int) -> int:
+    """The first port of loopback from `first` on that nobody uses."""
+    for port in range(first, first + 100):
+        with socket.socket() as tried:
+            tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                tried.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+            return port
+    raise UsageError(f"no port from {first} to {first + 99} is free for the viewer; end another run")

@@ -187,7 +187,8 @@ def _inputs(name: str, entry: NodeSpec, known: list[str], scope: Scope | None) -
             inputs[key] = resolved(key, value, scope)
             _check_known(inputs[key], known, value.place)
         elif key not in parameters:
-            meant = nearest_or_all(key, [*ports, *parameters, "use", "optional"])
+            valid = [*ports, *parameters, "use", "optional"]
+            meant = nearest(key, [*valid, *entry.inner_parameters()]) or nearest_or_all(key, valid)
             raise value.key_place.error(f"{entry.use} has no input or parameter '{key}'{meant}")
     for port in ports:
         if port not in inputs and port not in unneeded:

@@ -59,6 +59,11 @@ class NodeSpec:
         """The parameters of its class."""
         return parameters_of(self.kind)
 
+    def inner_parameters(self) -> list[str]:
+        """The parameters of its parameters that are dataclasses, such as `rover.max_slope`."""
+        kinds = {name: dataclass_of(hints_of(self.kind)[name]) for name in self.parameters()}
+        return [f"{name}.{inner}" for name, kind in kinds.items() if kind is not None for inner in parameters_of(kind)]
+
     def made(self, inputs: Collection[str] = ()) -> Any:
         """The object that the entry describes; inputs: keys that are no parameters."""
         try:

@@ -12,6 +12,8 @@ import yaml
 from flow.contracts import nearest
 from flow.runtime.graph import YamlLocation
 
+MAX_VALUES = 100_000  # of a pipeline file
+
 
 @dataclass(frozen=True)
 class Value:
@@ -55,6 +57,8 @@ def read(text: str, at: Callable[[int], YamlLocation]) -> Value:
     """YAML as values; at: the place of a line. Raises PipelineError for invalid YAML."""
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
+        if root is not None and _size(root, {}) > MAX_VALUES:
+            raise at(1).error(f"too large after expanding YAML aliases (limit: {MAX_VALUES} values)")
         return Value(None, at(1)) if root is None else _located(root, at, yaml.SafeLoader(""))
     except RecursionError:
         raise at(1).error("nested too deep; does a YAML anchor contain itself?") from None
@@ -86,3 +90,12 @@ def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.Sa
     except (AttributeError, LookupError, ValueError) as error:  # in the form of a type, but no such value
         kind = node.tag.rpartition(":")[2]
         raise place.error(f"{reprlib.repr(node.value)} looks like a YAML {kind} but is none; quote it") from error
+
+
+def _size(node: Any, sizes: dict[int, int]) -> int:
+    """The number of values in a YAML node, an alias counted wherever it is used; sizes: of the nodes so far."""
+    if id(node) not in sizes:
+        parts = node.value if isinstance(node, yaml.CollectionNode) else ()
+        inner = [part for part in parts for part in (part if isinstance(part, tuple) else (part,))]
+        sizes[id(node)] = 1 + sum(_size(part, sizes) for part in inner)
+    return sizes[id(node)]

@@ -208,6 +208,17 @@ def test_a_log_of_the_same_stamps_and_other_content_is_noted(traverse, fast_resu
     assert f"there is no log {none}, which --log names\n" in refused(*words, none)
 
 
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9999])
+def test_a_result_that_was_cut_is_said_to_be_incomplete(traverse, fast_result, share, tmp_path, said):
+    data, cut = fast_result.read_bytes(), tmp_path / "out.mcap"
+    words = ("--at", 0.6, "--cell", "3,0", "--log", traverse)
+    cut.write_bytes(data[: int(share * len(data))])
+    notes = [line for line in said(0, "why", cut, *words).out.splitlines() if line.startswith("note: ")]
+    why = "its end is missing" if share > 0.99 else "the log is truncated or damaged"
+    assert [note.partition(" at byte ")[0] for note in notes] == [f"note: {cut} is incomplete: {why}"]
+    assert "note: " not in said(0, "why", fast_result, *words).out
+
+
 def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, said, refused):
     grids = messages(fast_result, "/nav/regional_navigation_map")
     end, grid = max(grids), read_occupancy_grid(grids[max(grids)])

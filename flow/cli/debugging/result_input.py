@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from flow.cli.debugging.instants import is_other
+from flow.cli.report import say
 from flow.config.loader import load
 from flow.errors import RoverflowError, UsageError
 from flow.runtime.graph import Graph
@@ -29,6 +30,16 @@ def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = Fa
         file.write_text(about["pipeline"], encoding="utf-8")
         own = [*about["overrides"].splitlines(), *about.get("fixed", "").splitlines()]
         return load(str(file), [*own, *changes], with_sinks=with_sinks)
+
+
+def note_damage(result: Path) -> None:
+    """Print a note if a result log is incomplete, as an interrupted copy is."""
+    from recordings.mcap.file import McapFile
+
+    with McapFile(result) as log:
+        end = ["its end is missing"] if log.index.walked else []
+        for reason in dict.fromkeys(item.reason for item in log.index.lost) or end:
+            say(f"note: {result} is incomplete: {reason}")
 
 
 @contextmanager

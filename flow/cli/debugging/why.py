@@ -45,9 +45,11 @@ def run(options: argparse.Namespace) -> int:
     out = options.out or options.result.with_name(f"{options.result.stem}-why.png")
     check_outputs({"picture": out}, [options.result])
     from flow.cli.debugging.explanation import why
+    from flow.cli.debugging.result_input import note_damage
     from recordings.comparison.marked_pixels import write_marked
 
     options.at = without_cursor(options.at)
+    note_damage(options.result)
     if _is_regional(options.result, options.map):
         return _regional(options)
     pixel = None if options.pixel is None else (round(options.pixel[0]), round(options.pixel[1]))

@@ -108,6 +108,8 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
 
 @pytest.mark.parametrize(("old", "new", "line", "words"), [
     ("factor", "faktor", 5, ["no input or parameter 'faktor'", "did you mean 'factor'"]),
+    ("tests.flow.toys.Scale, couple: both, factor: 25 cm, bad: [1, 2.5]", "stages.Binarise, max_slope: 10 deg", 5,
+     ["no input or parameter 'max_slope'", "did you mean 'rover.max_slope'"]),
     ("25 cm", "quick", 5, ["factor", "'quick' is not a number"]),
     ("25 cm", "25 ms", 5, ["'25 ms' is a time", "expected a length in cm or m"]),
     ("25 cm", "25 parsec", 5, ["unknown unit 'parsec'; expected mm, cm, m, km"]),
