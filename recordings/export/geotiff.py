@@ -15,7 +15,6 @@ import numpy as np
 import tifffile
 
 from recordings.export.georeference import Georeference
-from recordings.export.layer_units import unit_and_meaning
 from recordings.export.mosaic import Mosaic
 from stages.data import Array
 
@@ -27,6 +26,34 @@ PIXEL_SCALE, TIE_POINT, TRANSFORMATION, GEO_KEYS, GEO_TEXT, BANDS, NO_DATA = (
 MODEL_TYPE, RASTER_TYPE, CITATION, PROJECTED_CRS, LINEAR_UNITS = 1024, 1025, 1026, 3072, 3076
 USER_DEFINED, PROJECTED, PIXEL_IS_AREA, METRE = 32767, 1, 1, 9001
 DOUBLE, SHORT, ASCII = 12, 3, 2
+LAYERS = {  # unit (UDUNITS) and meaning
+    "elevation": ("m", "mean height"),
+    "minimum": ("m", "least height"),
+    "maximum": ("m", "greatest height"),
+    "count": ("", "measured points"),
+    "interpolated": ("", "1: may rest on pixels of neighbouring cells only"),
+    "variance": ("m^2", "variance of the elevation within a frame"),
+    "common_variance": ("m^2", "variance of the elevation from the tilt"),
+    "occluded": ("", "1: hidden from the cameras"),
+    "ceiling": ("m", "lowest line of sight over an occluded cell"),
+    "filled": ("m", "mean height of points that are not measured"),
+    "unmatched": ("", "why no pixel was matched: 1 dark, 2 burnt out, 3 bare (textureless), 4 other"),
+    "ground": ("m", "height of the ground below obstacles"),
+    "step": ("m", "height of an obstacle or depth of a pit"),
+    "slope": ("rad", "slope of the ground below the footprint"),
+    "steepness": ("rad", "slope below a wheel"),
+    "roughness": ("m", "RMS of heights off their plane"),
+    "support": ("", "share of known cells within a wheel's diameter"),
+    "drop": ("m", "minimum depth of an occluded cell below the ground"),
+    "first": ("s", "first time the cell was seen, after the map's epoch"),
+    "last": ("s", "last time the cell was seen, after the map's epoch"),
+    "frames": ("", "frames that saw the cell"),
+    "logs": ("", "logs that saw the cell"),
+    "best_log": ("", "number of the log with the smallest variance, as in merge.json"),
+    "disagreement": ("m", "largest difference of two logs' heights"),
+    "conflicts": ("", "pairs of logs whose heights differ by more than 3 sigma"),
+    "contradictions": ("", "frames that contradicted the height"),
+}  # fmt: skip
 
 
 def write_geotiff(
@@ -73,7 +100,7 @@ def _bands(layers: Sequence[str]) -> bytes:
     """GDAL's description of the bands: the layer's name, its unit and its meaning."""
     items = []
     for number, layer in enumerate(layers):
-        unit, meaning = unit_and_meaning(layer)
+        unit, meaning = LAYERS.get(layer, ("", ""))
         described = {"DESCRIPTION": (layer, "description"), "UNITTYPE": (unit, "unittype"), "MEANING": (meaning, "")}
         for name, (text, role) in described.items():
             roles = f' role="{role}"' if role else ""

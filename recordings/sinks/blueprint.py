@@ -311,10 +311,7 @@ def _plot(specs: Iterable[ViewSpec], title: str, **options: Any) -> rrb.View | N
 
 def _panel(drawn: Specs, panel: Panel, title: str, in_tab: bool) -> _Part | None:
     """The numbers of a panel over time."""
-    specs = _at(drawn, panel)
-    if panel is Panel.FEATURES:  # a single curve
-        return _plot(specs, title, plot_legend=_HIDDEN)
-    return _named(specs, title, f"{CURVES}/{panel.name}", in_tab)
+    return _named(_at(drawn, panel), title, f"{CURVES}/{panel.name}", in_tab)
 
 
 def _named(specs: Iterable[ViewSpec], title: str, names_at: str, in_tab: bool) -> _Part | None:

@@ -378,9 +378,8 @@ def log_hazards_in_view(
     size = scale * np.array([camera.width, camera.height])
     inside = np.all((pixels >= 0) & (pixels < size), axis=1)
     radii = np.maximum(1.0, 0.4 * terrain.resolution * camera.fx * scale / seen[inside, 2])
-    whole = np.clip(pixels[inside], radii[:, None], size - radii[:, None])  # a dot over the edge would move the image
     colors = [(*colormaps.CELL_LEGEND[Cell.HAZARD][1], 150)]
-    dots = drawn(rr.Points2D, positions=whole, colors=colors, radii=radii, draw_order=20.0)
+    dots = drawn(rr.Points2D, positions=pixels[inside], colors=colors, radii=radii, draw_order=20.0)
     canvas.log(f"{stream}/left/hazards", dots)
 
 
