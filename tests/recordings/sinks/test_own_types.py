@@ -107,10 +107,6 @@ def test_images_become_sensor_msgs_images(tmp_path, dtype, shape, encoding):
     read = written(tmp_path / "out.mcap", {"own/image": np.ndarray}, {"own/image": pixels})["/nav/own/image"]
     assert (read.__msgtype__, read.encoding, read.height, read.width) == ("sensor_msgs/msg/Image", encoding, 4, 6)
     np.testing.assert_array_equal(array_of(read), 255 * pixels.astype(np.uint8) if dtype is bool else pixels)
-    if encoding == "mono8" and dtype is bool:
-        np.testing.assert_array_equal(read.data.reshape(4, 6), 255 * pixels.astype(np.uint8))
-    elif encoding == "32FC1":
-        np.testing.assert_array_equal(read.data.view(np.float32).reshape(4, 6), pixels)
 
 
 def test_a_dataclass_becomes_a_topic_per_field(tmp_path):
@@ -135,20 +131,17 @@ def test_an_array_of_more_dimensions_is_read_back_in_its_shape(tmp_path):
     np.testing.assert_array_equal(array_of(read), tensor)
 
 
-def test_keys_of_a_table_that_share_a_topic_are_an_error(tmp_path):
-    with pytest.raises(LogError, match="cannot write both 'own/a b' and 'own/a_b' to /nav/own/a_b"):
-        written(tmp_path / "out.mcap", {"own": dict[str, float]}, {"own": {"a b": 1.0, "a_b": 2.0}})
+LARGE = "cannot write 'own': a whole number beyond 64 bits has no standard form"
 
 
-def test_a_value_unlike_its_annotation_is_an_error(tmp_path):
-    with pytest.raises(LogError, match="cannot write 'own/a': a value of type bytes has no standard form"):
-        written(tmp_path / "out.mcap", {"own": dict}, {"own": {"a": b"raw"}})
-
-
-@pytest.mark.parametrize("value", [1 << 63, -(1 << 63) - 1, np.array([1, 1 << 63], np.uint64)])
-def test_a_whole_number_beyond_64_bits_is_an_error(tmp_path, value):
-    with pytest.raises(LogError, match="cannot write 'own': a whole number beyond 64 bits has no standard form"):
-        written(tmp_path / "out.mcap", {"own": type(value)}, {"own": value})
+@pytest.mark.parametrize(("kind", "value", "why"), [
+    (dict[str, float], {"a b": 1.0, "a_b": 2.0}, "cannot write both 'own/a b' and 'own/a_b' to /nav/own/a_b"),
+    (dict, {"a": b"raw"}, "cannot write 'own/a': a value of type bytes has no standard form"),  # unlike its annotation
+    (int, 1 << 63, LARGE), (int, -(1 << 63) - 1, LARGE), (np.ndarray, np.array([1, 1 << 63], np.uint64), LARGE),
+])  # fmt: skip
+def test_a_value_without_a_message_or_a_topic_is_an_error(tmp_path, kind, value, why):
+    with pytest.raises(LogError, match=why):
+        written(tmp_path / "out.mcap", {"own": kind}, {"own": value})
 
 
 @pytest.mark.parametrize(("kind", "why"), [
