@@ -87,10 +87,7 @@ def _disparities(one: Any, other: Any) -> Measures:
 
 
 def _maps(one: Any, other: Any) -> Measures:
-    grids = [_grid_of(message) for message in (one, other)]
-    if grids[0].resolution != grids[1].resolution:
-        return {"maps of other resolution": 1.0}
-    first, second = (grid.layers for grid in on_one_grid(*grids))
+    first, second = (grid.layers for grid in on_one_grid(_grid_of(one), _grid_of(other)))
     found = _changes(first["elevation"], second["elevation"], "cells", "cm", 100.0) if "elevation" in first else {}
     others = (name for name in first if name != "elevation")
     return found | {f"cells of layer {name}": float(np.sum(_differ(first[name], second[name]))) for name in others}
@@ -103,10 +100,8 @@ def _grid_of(message: Any) -> GridLayers:
 
 
 def _verdicts(one: Any, other: Any) -> Measures:
-    grids = read_occupancy_grid(one), read_occupancy_grid(other)
-    if grids[0].resolution != grids[1].resolution:
-        return {"maps of other resolution": 1.0}
-    first, second = (grid.cells for grid in verdicts_on_one_grid(*grids))
+    grids = verdicts_on_one_grid(read_occupancy_grid(one), read_occupancy_grid(other))
+    first, second = (grid.cells for grid in grids)
     return {
         f"cells from {name} to {_CELLS[after]}": float(np.sum((first == before) & (second == after)))
         for before, name in _CELLS.items()
