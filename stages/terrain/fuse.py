@@ -32,8 +32,12 @@ MAX_GRADIENT = 3.0  # rise per run of a cell in the variance of misplaced frames
 
 
 @dataclass(frozen=True)
-class _Fusion(Stage):
-    """What `Fuse` and `FuseRegion` share: parameters, state and the work."""
+class FuseRegion(Stage):
+    """Merges levelled clouds into the cells of a region, which `MapRegion` turns into maps.
+
+    The region starts again if the pose's frame changes. `mount` may be left out if the pose is the camera's.
+    docs/terrain.md describes the alignment and the variance.
+    """
 
     resolution: float = parameter(0.05, "cell size", unit="m", low=0.005, high=2.0)
     max_range: float = parameter(
@@ -88,7 +92,7 @@ class _Fusion(Stage):
                 state.cells.write(row, col, cells, cells["weight"] != 0)
         return state
 
-    def _fused(self, cloud: PointCloud, pose: Pose, mount: Mount | None, state: FusedMap) -> Region:
+    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
         """The region in the pose's frame, with a cloud in frame `level` merged in."""
         self._check(cloud, state)
         level, up = register(self, cloud, pose, mount)
@@ -235,20 +239,7 @@ class _Fusion(Stage):
 
 
 @dataclass(frozen=True)
-class FuseRegion(_Fusion):
-    """Merges levelled clouds into the cells of a region, which `MapRegion` turns into maps.
-
-    The region starts again if the pose's frame changes. `mount` may be left out if the pose is the camera's.
-    docs/terrain.md describes the alignment and the variance.
-    """
-
-    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
-        """The region in the pose's frame, with a cloud in frame `level` merged in."""
-        return self._fused(cloud, pose, mount, state)
-
-
-@dataclass(frozen=True)
-class Fuse(_Fusion):
+class Fuse(FuseRegion):
     """Merges levelled clouds into a regional map, and returns the map around the rover with each of them.
 
     It does at once what `FuseRegion` and `MapRegion` do one after the other, for a map of every frame.
@@ -272,7 +263,9 @@ class Fuse(_Fusion):
         super().__post_init__()
         check_cells("Fuse.window", self.window, self.resolution)
 
-    def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> ElevationMap:
+    def __call__(  # type: ignore[override]
+        self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap
+    ) -> ElevationMap:
         """The map around the rover, in the pose's frame, with a cloud in frame `level` merged in."""
-        region = self._fused(cloud, pose, mount, state)
+        region = super().__call__(cloud, pose, mount, state=state)
         return map_around(region, self.window, region.changed)
