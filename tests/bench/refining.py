@@ -53,7 +53,7 @@ def stereo_part(
     disparities: the range at full size; a coarser one keeps its share of it; changes: parameters of every stage that
     has them; given: streams that are not made but taken as they are.
     """
-    graph, nodes = _loaded(pipeline), []
+    graph, nodes = graph_of(pipeline), []
     for node in graph.nodes:
         actor, names = node.actor, {field.name for field in fields(node.actor)}
         if "disparities" in names:
@@ -65,14 +65,15 @@ def stereo_part(
 
 
 @functools.cache
-def _loaded(pipeline: str) -> Graph:
+def graph_of(pipeline: str) -> Graph:
+    """A pipeline, loaded once."""
     return load(pipeline)
 
 
 @functools.cache
 def stage(pipeline: str, name: str) -> Any:
     """The stage that makes a stream of a pipeline."""
-    return next(node.actor for node in _loaded(pipeline).nodes if node.name == name)
+    return next(node.actor for node in graph_of(pipeline).nodes if node.name == name)
 
 
 def scenes(folder: Path) -> Iterator[tuple[str, StereoFrame, Array, Array, int]]:

@@ -12,18 +12,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flow.config.loader import load
 from recordings.importers.middlebury import read_scene
 from recordings.scoring.stereo_metrics import StereoErrors
 from stages.data import Array, StereoCamera, StereoFrame
-from stages.matching.match_opencv import MatchOpenCV
-from stages.refinement.paper import RefinePaper
-
-
-def paper_stages() -> tuple[MatchOpenCV, RefinePaper]:
-    """Matching and refinement as the pipeline `paper` sets them."""
-    actors = {node.name: node.actor for node in load("paper").nodes}
-    return actors["matched"], actors["disparity"]
 
 
 def load_scene(folder: Path) -> tuple[StereoFrame, Array, Array, int]:

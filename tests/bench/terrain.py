@@ -26,8 +26,6 @@ from scipy.spatial.transform import Rotation
 
 from flow.align import Token
 from flow.cli import arguments
-from flow.config.loader import load
-from flow.runtime.graph import Graph
 from flow.runtime.malloc import keep_freed_memory
 from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
@@ -36,6 +34,7 @@ from recordings.simulator.scenes import SCENES
 from recordings.simulator.simulation import TILT_RATE, FrameTruth, Simulation
 from recordings.source.tilt_noise import WINDOW, TiltNoise
 from stages.data import Array, Cell, Disparity, Mount, PixelOrigin, StereoFrame, Tilt, Transform
+from tests.bench.refining import graph_of, stage
 
 SLOPE, TILT_NOISE = np.radians(5.0), np.radians(0.3)
 RUNS = {name: name for name in ("rover", "fast", "accurate", "paper")} | {"rover, true disparity and tilt": "rover"}
@@ -88,7 +87,7 @@ def frames(simulation: Simulation, stride: int) -> Iterator[tuple[dict[str, Any]
 def measured_tilt(pipeline: str, simulation: Simulation, stamp: int) -> Tilt:
     """The tilt as the pipeline's own aligner makes it of the inclinometer's samples about a frame."""
     number = int((stamp - simulation.begin) * 1e-9 * TILT_RATE)
-    aligner = next(node.actor for node in graph_of(pipeline).nodes if node.name == "tilt")
+    aligner = stage(pipeline, "tilt")
     state, noise = aligner.start("tilt", {"stream": "inclinometer"}), TiltNoise()
     for sample in range(max(number - WINDOW, 0), number + TILT_SAMPLES + 1):
         at = simulation.begin + round(sample / TILT_RATE * 1e9)
@@ -136,12 +135,6 @@ def seen_by_both(simulation: Simulation, stamp: int, truth: FrameTruth) -> Dispa
     source = np.where(known, np.uint8(PixelOrigin.MEASURED), np.uint8(PixelOrigin.UNKNOWN))
     pixels = np.where(known, true.pixels, np.float32(np.nan))
     return Disparity(stamp, pixels, source, known.astype(np.float32), camera=simulation.camera)
-
-
-@cache
-def graph_of(pipeline: str) -> Graph:
-    """A pipeline, loaded once."""
-    return load(pipeline)
 
 
 def through(pipeline: str, streams: dict[str, Any]) -> tuple[dict[str, Any], float]:

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flow.config.loader import load
 from stages.data import PixelOrigin, StereoCamera, StereoFrame
 from stages.refinement.paper import RefinePaper
+from tests.bench.refining import stage
 from tests.stages.builders import disparity_of
 
 SHAPE = HEIGHT, WIDTH = 90, 120
@@ -92,5 +92,4 @@ def test_the_stamp_decides_every_bit_also_of_two_frames_at_once(monkeypatch):
 
 
 def test_the_pipeline_paper_refines_with_it():
-    actor = next(node.actor for node in load("paper").nodes if node.name == "disparity")
-    assert actor == RefinePaper()
+    assert stage("paper", "disparity") == RefinePaper()

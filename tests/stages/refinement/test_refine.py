@@ -11,7 +11,7 @@ from stages.data import PixelOrigin, StereoFrame
 from stages.data import known as known_origin
 from stages.refinement import refine as module
 from stages.refinement.refine import MAX_EVEN_CONTRAST, Refine, _saturated
-from tests.bench.stereo_scores import paper_stages
+from tests.bench.refining import stage
 from tests.stages.builders import disparity_of
 from tests.stages.refinement.flat_scene import CAMERA, GRAY, HEIGHT, SHAPE, WIDTH, flat, matched
 
@@ -216,7 +216,8 @@ def test_a_match_moves_to_its_median_where_that_is_near():
 
 
 @pytest.mark.parametrize(
-    "refine", [Refine(), paper_stages()[1], Refine(fill=False, bilateral_radius=0, edge_radius=0, median_size=0)]
+    "refine",
+    [Refine(), stage("paper", "disparity"), Refine(fill=False, bilateral_radius=0, edge_radius=0, median_size=0)],
 )
 def test_a_frame_without_matches_stays_unknown(refine):
     refined = refine(FRAME, matched(flat(np.nan)))
