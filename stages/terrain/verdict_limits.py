@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 from stages.data import Cell, ElevationMap
 from stages.terrain.binarise import Binarise
 
-FACTORS = tuple(1.1**step for step in range(1, 25))  # by which a parameter is changed, up to ten times its value
-PRECISION = 0.01  # of a parameter that would turn the verdict
+FACTORS = tuple(1.01**step for step in range(1, 232))  # by which a parameter is changed, up to ten times its value
 _LIMITS = ("max_step", "ground_clearance", "max_slope")  # of the rover
 
 
@@ -103,17 +102,7 @@ def _turned(
     # Every test of the rule has one side of its limit, so a verdict that has turned does not turn back.
     first = bisect_left(factors, True, lo=1, key=lambda factor: at(factor) != verdict)
     turned = at(factors[first]) if first < len(factors) else None
-    if turned is None:
-        return None
-    low, high = factors[first - 1], factors[first]
-    while abs(high / low - 1) > PRECISION:
-        middle = math.sqrt(low * high)
-        between = at(middle)
-        if between is None or between == verdict:
-            low = middle
-        else:
-            high, turned = middle, between
-    return high, Cell(turned)
+    return None if turned is None else (factors[first], Cell(turned))
 
 
 def _numbers(rule: Binarise) -> Iterator[tuple[str, float, str]]:
