@@ -72,12 +72,6 @@ def test_the_other_thread_takes_the_bands_of_a_busy_one():
     assert done[-1] == 0
 
 
-@pytest.mark.parametrize("both", [in_turn, at_once])
-def test_a_failure_in_a_band_is_raised(both):
-    with pytest.raises(ZeroDivisionError):
-        by_bands(both, 100, lambda first, _: 1 // first)
-
-
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_process_has_threads_of_its_own():

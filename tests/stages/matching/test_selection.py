@@ -33,7 +33,7 @@ def test_a_row_is_selected_as_by_the_reference(disparities, minimum):
     width = Width(lanes)
     total = rng.integers(5, 40, (columns, lanes)).astype(np.uint8)  # with many ties
     for x in range(columns):
-        d = min(disparities - 1, max(0, 50 - minimum + x // 20))
+        d = min(disparities - 1, max(0, 40 - minimum + 3 * (x // 20)))
         total[x, max(0, d - 1) : d + 2] = (4, 2, 3)[: len(total[x, max(0, d - 1) : d + 2])]
     guard = np.where(np.abs(np.arange(2 * lanes) - lanes) <= 1, 255, 0).astype(np.uint8)
     beyond = np.where(np.arange(lanes) < disparities, 0, 255).astype(np.uint8)
