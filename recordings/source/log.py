@@ -89,10 +89,7 @@ class McapLog:
         """The number of left images in the range; None if the log has none."""
         if "left" not in self.topics:
             return None
-        part = self._range()
-        if not part.edges:
-            return self.file.count(self.channels("left"))
-        times = self.file.times(self.channels("left"))
+        part, times = self._range(), self.file.times(self.channels("left"))
         return int(np.sum((times >= (part.low or 0)) & (times < (part.high or 1 << 62))))
 
     def narrow(self, start: float, end: float) -> None:
