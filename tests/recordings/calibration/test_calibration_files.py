@@ -249,7 +249,8 @@ ALIASES = "a0: &a0 [1, 1]\n" + "".join(f"a{n + 1}: &a{n + 1} [*a{n}, *a{n}]\n" f
 
 @pytest.mark.parametrize("content", [
     "[1, 2", "- a", "", "!!python/object:os.system {}", "\x00", "!!timestamp x: 1", "a: &a [*a]", ALIASES,
-], ids=["cut", "list", "empty", "object", "zero", "no time", "contains itself", "aliases"])  # fmt: skip
+    "a: " + "[" * 2000, "a: " + "9" * 5000,
+], ids=["cut", "list", "empty", "object", "zero", "no time", "in itself", "aliases", "deep", "long"])  # fmt: skip
 def test_a_file_that_is_no_mapping_is_refused(tmp_path, content):
     (tmp_path / "file.yaml").write_text(content)
     with pytest.raises(LogError, match=r"the calibration .*file\.yaml"):

@@ -169,15 +169,6 @@ def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
     assert "--set tilt.patience=22s" in format_description(inventory_of(late))
 
 
-@pytest.mark.parametrize("seconds", [100, -37])
-def test_tilts_of_another_clock_are_doubted(tmp_path, seconds):
-    edit = changed(TILT, {"header.stamp.sec": lambda stamp: stamp + seconds})
-    text = format_description(inventory_of(write_sample(tmp_path / "log.mcap", edit)))
-    doubt = f"the stamps of tilts and images are of clocks that differ by {abs(seconds):.1f} s; record both with one"
-    assert f"doubtful: {doubt}" in text
-    assert "tilt.patience" not in text
-
-
 WIDER = "differ by up to 8 ms; if they are taken at one time, --set stereo.slop=8ms pairs most of them"
 
 
@@ -236,11 +227,6 @@ def test_undecodable_topics_are_listed_once(tmp_path):
     assert "missing: left, right: the log has no camera image" in text
     with McapSource().open(path) as log:  # a refusal is complete without the others
         assert all(f"{LEFT}: its messages" in log.missing[stream] for stream in ("left", "inclinometer", "odometry"))
-
-
-def test_singular_and_plural_are_correct(tmp_path):
-    text = text_of(tmp_path, dropped("", numbers=range(1, FRAMES)))
-    assert "1 stereo pair (stamps within 5 ms) from 1 left image and 1 right image; 1 left image with" in text
 
 
 def test_damage_is_reported(tmp_path):

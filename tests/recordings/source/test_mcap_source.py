@@ -199,11 +199,6 @@ def bare(tmp_path: Path, x: float, y: float) -> Path:
 PITCH, ROLL = AngleField("vector.x", "deg", 1), AngleField("vector.y", "deg", -1)
 
 
-def test_plain_angles_are_not_guessed(tmp_path):
-    problems = missing_in(bare(tmp_path, 10, 20))["inclinometer"]
-    assert "set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model' of the source" in problems
-
-
 def test_plain_angles_are_read_by_the_settings(tmp_path):
     source = McapSource(pitch=PITCH, roll=ROLL, tilt_model="axis")
     tilt = next(item for _, stream, item in items_of(bare(tmp_path, 10, 20), source) if stream == "inclinometer")

@@ -181,9 +181,6 @@ def test_the_angles_of_joints_move_the_camera(tmp_path):
 @pytest.mark.parametrize(("content", "sentence"), [
     ("", "is not a mapping; write lines of NAME: VALUE"),
     ("{}", "has no joints; write one entry each"),
-    ("pan: !!timestamp x", "cannot be read as YAML"),
-    ("pan: " + "[" * 2000, "cannot be read as YAML"),
-    ("pan: " + "9" * 5000, "cannot be read as YAML"),
     (f"pan: {{parent: a, child: b, xyz: [1, 2, {'9' * 400}]}}", "'xyz' of"),
     ("pan: [1, 2]", "joint 'pan' is not a mapping"),
     ("pan: {parent: a, child: b, angle: 3}", "joint 'pan' has the unknown key 'angle'"),

@@ -239,7 +239,10 @@ def test_an_inclinometer_may_log_three_accelerations(tmp_path, field, sign):
         return {"/inclinometer": logged}
 
     path = written(tmp_path / "log.mcap", driven, accelerations)
-    assert "whose numbers have no defined meaning; set 'pitch', 'roll'" in missing(path)
+    assert (
+        "whose numbers have no defined meaning; set 'pitch', 'roll' (each field, unit, sign) and 'tilt_model'"
+        in missing(path)
+    )
     tilts, _, note = read(path, McapSource(accelerations=AccelerationField(field, sign)))
     assert driven.errors(tilts[:400]).max() < 0.5
     assert "the direction of the acceleration on /inclinometer, right only at rest" in note

@@ -90,7 +90,10 @@ def test_info_counts_pairs_and_tilts_by_corrected_stamps(tmp_path):
 def test_info_names_the_offset_of_another_clock(tmp_path, seconds):
     path = write_sample(tmp_path / "log.mcap", changed(TILT, {"header.stamp.sec": lambda stamp: stamp + seconds}))
     setting = f"--set source.time_offset.inclinometer={-seconds}.000s corrects the tilts"
-    assert setting in format_description(inventory_of(path))
+    text = format_description(inventory_of(path))
+    assert f"doubtful: the stamps of tilts and images are of clocks that differ by {abs(seconds):.1f} s" in text
+    assert setting in text
+    assert "tilt.patience" not in text
     for given in (-seconds, -seconds + 5):
         with McapSource(time_offset=TimeOffsets(inclinometer=given * 1_000_000_000)).open(path) as log:
             text = format_description(describe(log, max_gap_of=lambda intervals: 2 * PERIOD))
