@@ -93,7 +93,7 @@ class McapFile(Container):
                 if stated > counts.get(number, 0) and not self.lost:
                     found = f"the log contains {counts.get(number, 0)}"
                     index.note_damage(f"the log's statistics count {counted(stated, 'message')}, but {found}")
-            check_size(self.path, self.size, index.unpacked)
+            check_size(self.path, self.size, sum(chunk.unpacked for chunk in index.chunks))
             self.timeline = Timeline.of(index.message_channels, index.message_times)
             self.start, self.end = self._ends()
         except BaseException:
@@ -123,7 +123,8 @@ class McapFile(Container):
         yield from self.lost
 
     def _chunk_heads(self, chunk: StoredChunk, inside: NDArray[np.intp]) -> Iterator[RawMessage]:
-        numbers, times, offsets = (column[inside].tolist() for column in message_index(self._file, chunk))
+        found = message_index(self._file, chunk.offset + chunk.length, chunk.index_length)
+        numbers, times, offsets = (column[inside].tolist() for column in found)
         records = chunk_heads(self._file, chunk.offset + RECORD.size, offsets, RECORD.size + MESSAGE.size + HEAD_BYTES)
         for number, time, record in zip(numbers, times, records, strict=True):
             data = memoryview(record)[RECORD.size + MESSAGE.size :]
@@ -138,6 +139,7 @@ class McapFile(Container):
 
     def close(self) -> None:
         """Close the file."""
+        self._recent.cache_clear()
         self._file.close()
 
     def __enter__(self) -> McapFile:
@@ -165,7 +167,7 @@ class McapFile(Container):
     def _table(self, number: int) -> ChunkTable | str:
         """The unpacked chunk of a number, or why it is broken."""
         chunk = self.index.chunks[number]
-        return (self._recent if chunk.length <= _RECENT_BYTES else self._unpacked)(chunk)
+        return (self._recent if chunk.unpacked <= _RECENT_BYTES else self._unpacked)(chunk)
 
     def _unpacked(self, chunk: StoredChunk) -> ChunkTable | str:
         channels = self.timeline.channels[chunk.places.start : chunk.places.stop]

@@ -46,13 +46,14 @@ _TAIL = RECORD.size + _FOOTER_LENGTH + len(MAGIC)
 class StoredChunk(NamedTuple):
     """Where messages are.
 
-    offset, length: of the chunk record, bytes; places: of its messages in the timeline; index_length: of the message
-    index after it, bytes; is_cut: its end is missing; is_bare: messages outside chunks.
+    offset, length: of the chunk record, bytes; places: of its messages in the timeline; unpacked: bytes of its records;
+    index_length: of the message index after it, bytes; is_cut: its end is missing; is_bare: messages outside chunks.
     """
 
     offset: int
     length: int
     places: range
+    unpacked: int
     index_length: int = 0
     is_cut: bool = False
     is_bare: bool = False
@@ -63,8 +64,7 @@ class Index:
     """The index of a file.
 
     chunks: in file order; message_channels, message_times: of every message, in file order; lost: the damage found;
-    stated_counts: messages by channel, by the file's statistics; unpacked: bytes of all chunks; latest: the last log
-    time so far, ns.
+    stated_counts: messages by channel, by the file's statistics; latest: the last log time so far, ns.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -76,19 +76,18 @@ class Index:
     stated_counts: dict[int, int] = field(default_factory=dict)
     profile: str = ""
     walked: bool = False
-    unpacked: int = 0
     latest: int = 0
 
-    def add(self, offset: int, length: int, channels: Any, times: Any, **kind: Any) -> None:
+    def add(self, offset: int, length: int, unpacked: int, channels: Any, times: Any, **kind: Any) -> None:
         """Add the next messages of the file, in a chunk or outside.
 
-        channels, times: arrays of 16 and 64 bits; kind: fields of `StoredChunk`.
+        channels, times: arrays of 16 and 64 bits; the rest: fields of `StoredChunk`.
         """
         first, times = len(self.message_times), np.asarray(times, np.uint64)
         self.message_channels.frombytes(channels.tobytes())
         self.message_times.frombytes(times.tobytes())
         self.latest = max(self.latest, int(np.max(times[times <= MAX_LOG_TIME], initial=0)))
-        self.chunks.append(StoredChunk(offset, length, range(first, len(self.message_times)), **kind))
+        self.chunks.append(StoredChunk(offset, length, range(first, len(self.message_times)), unpacked, **kind))
 
     def define(self, opcode: int, content: bytes | memoryview) -> None:
         """Store a schema or a channel; other records are ignored."""
@@ -143,10 +142,9 @@ def index_from_summary(file: BinaryIO, size: int) -> Index | None:
     if not whole:
         return None
     for chunk in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
-        stored = StoredChunk(chunk.chunk_start_offset, chunk.chunk_length, range(0), chunk.message_index_length)
-        channels, times, _ = message_index(file, stored)
-        index.add(stored.offset, stored.length, channels, times, index_length=stored.index_length)
-        index.unpacked += chunk.uncompressed_size
+        offset, length, index_length = chunk.chunk_start_offset, chunk.chunk_length, chunk.message_index_length
+        channels, times, _ = message_index(file, offset + length, index_length)
+        index.add(offset, length, chunk.uncompressed_size, channels, times, index_length=index_length)
     stated = {channel: count for channel, count in index.stated_counts.items() if count}
     if not stated or index.counts() != stated or not stated.keys() <= index.channels.keys():
         return None
@@ -159,11 +157,11 @@ def index_from_summary(file: BinaryIO, size: int) -> Index | None:
 
 
 def message_index(
-    file: BinaryIO, chunk: StoredChunk
+    file: BinaryIO, position: int, length: int
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint64], NDArray[np.uint64]]:
     """Channel, log time and offset of each message of a chunk, in file order; empty without a message index."""
     channels, entries = [np.zeros(0, np.uint16)], [np.zeros((0, 2), np.uint64)]
-    section = read_at(file, chunk.offset + chunk.length, min(chunk.index_length, _MAX_SECTION_BYTES))
+    section = read_at(file, position, min(length, _MAX_SECTION_BYTES))
     with suppress(*PARSE_ERRORS):
         for opcode, content in iter_records(section):
             if opcode == Opcode.MESSAGE_INDEX:

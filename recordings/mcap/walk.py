@@ -101,7 +101,8 @@ def _note(index: Index, opcode: int, content: bytes, length: int, position: int,
         _note_chunk(index, content, position)
     elif opcode == Opcode.MESSAGE:
         channel, _, log_time, _ = MESSAGE.unpack_from(content)
-        index.add(position, RECORD.size + length, array("H", [channel]), array("Q", [log_time]), is_bare=True)
+        whole = RECORD.size + length
+        index.add(position, whole, whole, array("H", [channel]), array("Q", [log_time]), is_bare=True)
     elif opcode == Opcode.HEADER and before == 0:
         index.profile = profile_of(content)
     elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -123,7 +124,7 @@ def _note_messages(index: Index, block: bytes, position: int) -> int:
         taken += RECORD.size + len(content)
     if taken:
         table = ChunkTable(block[:taken])
-        index.add(position, taken, table.channels, table.times, is_bare=True)
+        index.add(position, taken, taken, table.channels, table.times, is_bare=True)
     return taken
 
 
@@ -139,8 +140,7 @@ def _note_chunk(index: Index, content: bytes, position: int, is_cut: bool = Fals
     for opcode, record in iter_records(records, is_cut):
         index.define(opcode, record)
     if table.times:
-        index.add(position, RECORD.size + len(content), table.channels, table.times, is_cut=is_cut)
-        index.unpacked += len(records)
+        index.add(position, RECORD.size + len(content), len(records), table.channels, table.times, is_cut=is_cut)
 
 
 def _note_rest(index: Index, file: BinaryIO, position: int, size: int) -> None:

@@ -226,7 +226,7 @@ def test_an_impossible_log_time_loses_its_message(sample, whole, tmp_path, layou
 def test_losses_are_placed_after_the_last_message_before_them():
     index = Index()
     for time in (5, 9, 7):
-        index.add(0, 0, array("H", [1, 1]), array("Q", [time, 1 << 63]))
+        index.add(0, 0, 0, array("H", [1, 1]), array("Q", [time, 1 << 63]))
         index.note_damage("gone")
     assert [lost.log_time for lost in index.lost] == [5, 9, 9]
 
