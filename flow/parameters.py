@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import numbers
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, field, fields, is_dataclass
 from types import NoneType, UnionType
@@ -92,7 +91,7 @@ def check(value: Any, known: Field[Any], given: Any = None) -> None:
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if not is_number and (is_whole or low is not None or high is not None):
         raise ValueError(f"must be a number{of_unit}, not {shown!r}")
-    if is_number and not abs(value) <= sys.float_info.max:
+    if is_number and not _is_finite(value):
         raise ValueError(f"must be a finite number{of_unit}, not {shown}")
     if is_whole and not isinstance(value, numbers.Integral):
         raise ValueError(f"must be a whole number{of_unit}, not {shown}")
@@ -100,6 +99,13 @@ def check(value: Any, known: Field[Any], given: Any = None) -> None:
         raise ValueError(f"must be at least {_limit(low, unit)}, not {shown}")
     if high is not None and value > high:
         raise ValueError(f"must be at most {_limit(high, unit)}, not {shown}")
+
+
+def _is_finite(value: Any) -> bool:
+    try:
+        return math.isfinite(value)
+    except OverflowError:  # a whole number beyond those of floating point
+        return False
 
 
 def coerced(value: Any, kind: Any, known: Field[Any]) -> Any:
