@@ -80,6 +80,7 @@ class McapFile(Container):
         self.path = Path(path)
         self._file = opened(self.path)
         self._recent = lru_cache(maxsize=_RECENT)(self._unpacked)
+        self._large: tuple[int, ChunkTable | str] | None = None  # number and table of the last larger chunk
         try:
             self.size = self.path.stat().st_size
             self.index = index = index_from_summary(self._file, self.size) or walk(self._file, self.size)
@@ -140,6 +141,7 @@ class McapFile(Container):
     def close(self) -> None:
         """Close the file."""
         self._recent.cache_clear()
+        self._large = None
         self._file.close()
 
     def __enter__(self) -> McapFile:
@@ -167,7 +169,12 @@ class McapFile(Container):
     def _table(self, number: int) -> ChunkTable | str:
         """The unpacked chunk of a number, or why it is broken."""
         chunk = self.index.chunks[number]
-        return (self._recent if chunk.unpacked <= _RECENT_BYTES else self._unpacked)(chunk)
+        if chunk.unpacked <= _RECENT_BYTES:
+            return self._recent(chunk)
+        if self._large is None or self._large[0] != number:
+            self._large = None  # first, so that no two are in memory
+            self._large = number, self._unpacked(chunk)
+        return self._large[1]
 
     def _unpacked(self, chunk: StoredChunk) -> ChunkTable | str:
         channels = self.timeline.channels[chunk.places.start : chunk.places.stop]
