@@ -13,10 +13,11 @@ from recordings.ros2.cdr import plain, standard_types
 _STAMP_END = 12  # bytes of a message up to the end of its header's stamp
 # The time of Foxglove's messages is in the same place.
 _HEADER_FIRST = re.compile(
-    rb"\A(?:\s*(?:#[^\n]*)?\n)*\s*"
+    rb"\A(?:\s|#[^\n]*\n)*"
     rb"(?:(?:std_msgs/(?:msg/)?)?Header\s+header|(?:builtin_interfaces/(?:msg/)?)?Time\s+timestamp)\b"
 )
-_HEADER_FIRST_IDL = re.compile(rb"struct \w+ \{\s*(?:@[^\n]*\n\s*)*std_msgs::msg::Header_?\s+header\b")
+_ANNOTATION = rb'@\w+\s*(?:\((?:"(?:[^"\\]|\\.)*"|[^")])*\))?\s*'  # a comment has several lines
+_HEADER_FIRST_IDL = re.compile(rb"struct \w+ \{\s*(?:" + _ANNOTATION + rb")*std_msgs::msg::Header_?\s+header\b")
 
 
 def begins_with_header(channel: Channel) -> bool:

@@ -223,6 +223,9 @@ module vendor_msgs {
       "a Sample; # of" "\n"
       "things")
     struct Sample {
+      @verbatim (language="comment", text=
+        "the time (of" "\n"
+        "its start)")
       @unit (value="1")
       std_msgs::msg::Header header;
 
@@ -252,6 +255,12 @@ def test_idl_schemas_of_rosidl_are_read():
     assert (sample.KIND, sample.valid, sample.covariance.tolist()) == (3, True, [*range(9)])
     assert [(place.x, place.y) for place in sample.places] == [(0, 1), (2, 3)]
     assert begins_with_header(Channel(1, "/sample", "cdr", schema))
+
+
+def test_blank_lines_and_comments_before_a_header_are_skipped():
+    for text, is_first in ((b"Header header\n", True), (b"float64 x\nHeader header\n", False)):
+        schema = MessageSchema("a/A", "ros2msg", b"# Header header\n" + 1000 * b" \n" + text)
+        assert begins_with_header(Channel(1, "/a", "cdr", schema)) == is_first
 
 
 RECURSIVE = {
