@@ -133,12 +133,12 @@ def _note_chunk(index: Index, content: bytes, position: int, is_cut: bool = Fals
     try:
         records = unpack_cut_chunk(content) if is_cut else unpack_chunk(content)
         table = ChunkTable(records, is_cut)  # a whole chunk with a cut record is broken
+        for opcode, record in iter_records(records, is_cut):
+            index.define(opcode, record)
     except PARSE_ERRORS as error:
         if not is_cut:  # else nothing more can be rescued
             index.note_damage(lost_chunk(position, error), chunk_start_time(content))
         return
-    for opcode, record in iter_records(records, is_cut):
-        index.define(opcode, record)
     if table.times:
         index.add(position, RECORD.size + len(content), len(records), table.channels, table.times, is_cut=is_cut)
 

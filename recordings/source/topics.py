@@ -143,8 +143,7 @@ class DecodedTopics:
 
     def is_unstamped(self, topic: str) -> bool:
         """Whether the header stamps of a topic are 0 and not those of a clock that begins there."""
-        first = next(self.each(topic, lambda message: stamp_of(message.header)), None)
-        return first == 0 and not self.ahead_of(topic)
+        return self.first(topic, lambda message: stamp_of(message.header)) == 0 and not self.ahead_of(topic)
 
     def each(
         self, topic: str, make: Callable[[Any], T], start: int | None = None, allow_repeats: bool = False

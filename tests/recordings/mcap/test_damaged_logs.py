@@ -338,3 +338,36 @@ def test_the_starts_of_short_messages_in_one_chunk_are_their_own(tmp_path):
         writer.finish()
     with open_recording(path) as log:
         assert [peek_stamp(head.data) for head in log.heads({channel})] == stamps
+
+
+def test_a_damaged_definition_in_a_cut_chunk_costs_its_chunk(tmp_path):
+    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in range(1, 9)]
+    log = write_mcap(tmp_path / "log.mcap", rows, compression=CompressionType.NONE)
+    content = bytearray(log.read_bytes())
+    name = content.index(b"a/A")
+    struct.pack_into("<I", content, name - 4, 10**6)  # the length of the name
+    log.write_bytes(content[: name + 200])
+    with pytest.raises(LogError, match="contains no messages that can be read: the log is truncated or damaged"):
+        McapFile(log)
+
+
+def test_a_damaged_log_time_in_a_message_index_loses_no_message(tmp_path):
+    times = [1001, 1002, 1003, 1004]
+    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in times]
+    log = write_mcap(tmp_path / "log.mcap", rows)
+    content = bytearray(log.read_bytes())
+    struct.pack_into("<Q", content, content.rindex(struct.pack("<Q", 1002)), 10**6)
+    log.write_bytes(content)
+    with McapFile(log) as file:
+        assert [message.log_time for message in file.messages(set(file.channels), 1001, 1004)] == times[:3]
+        assert file.end == 1004
+
+
+def test_stamps_of_zero_are_recognised_if_the_first_message_is_lost(sample, tmp_path):
+    def unstamped(topic, index, data):
+        return data[:4] + bytes(8) + data[12:] if topic == LEFT else data
+
+    log = rewrite(sample, tmp_path / "log.mcap", unstamped, chunk_size=500)
+    first = next(chunk for chunk, topics in chunks_of(log) if topics == {LEFT})
+    with McapSource().open(with_broken(log, first)) as opened:
+        assert "the header stamps are 0" in opened.notes()["left"]
