@@ -145,7 +145,7 @@ def index_from_summary(file: BinaryIO, size: int) -> Index | None:
         offset, length, index_length = chunk.chunk_start_offset, chunk.chunk_length, chunk.message_index_length
         channels, times, _ = message_index(file, offset + length, index_length)
         ends = chunk.message_start_time, chunk.message_end_time
-        if len(times) and (np.min(times), np.max(times)) != ends:  # no CRC covers the message index
+        if len(times) and (int(np.min(times)), int(np.max(times))) != ends:  # no CRC covers the message index
             return None
         index.add(offset, length, chunk.uncompressed_size, channels, times, index_length=index_length)
     stated = {channel: count for channel, count in index.stated_counts.items() if count}
