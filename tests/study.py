@@ -49,10 +49,13 @@ class Case(NamedTuple):
 Chain = Callable[[dict[str, Any], Case], Disparity]
 
 
-def simulated(width: int = 640, height: int = 480, seeds: Iterable[int] = ABUNDANCES) -> Iterator[Case]:
+def simulated(
+    width: int = 640, height: int = 480, seeds: Iterable[int] = ABUNDANCES, scene: str = "mixed"
+) -> Iterator[Case]:
     """Frames of simulated traverses, of the ground within the search range."""
     for seed in seeds:
-        simulation = Simulation(frames=4, width=width, height=height, seed=seed, abundance=ABUNDANCES[seed])
+        rocks = ABUNDANCES[seed]
+        simulation = Simulation(scene=scene, frames=4, width=width, height=height, seed=seed, abundance=rocks)
         camera, found = simulation.camera, simulation.frame(1)
         truth = (camera.fx * camera.baseline / found.depth).astype(np.float32)
         disparities = 192 * width // 1280
