@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.containers.clock import SETTLING_NS, ClockStep, clock_steps
+from recordings.containers.clock import SETTLING_NS, ClockStep, clock_steps, corrected
 from recordings.containers.timeline import Timeline
 
 SECOND = 1_000_000_000
@@ -94,3 +94,11 @@ def test_a_step_without_stamps_is_judged_by_the_log_times_alone():
     assert clock_steps(Timeline.of(channels, times), set(), lambda place: 0) == []
     (step,) = steps_of(channels, times, stamps)
     assert step == ClockStep(step.place, step.shift, 0, step.fall)
+
+
+def test_damaged_times_stay_damaged_and_the_second_pass_ends_at_its_limit():
+    times = [50, 60, -1, 10, 20, 30]
+    step = ClockStep(place=2, shift=5, repeats_until=20, fall=50)
+    timeline, repeated = corrected(Timeline.of(np.zeros(6, int), np.array(times)), [step])
+    assert timeline.log_times.tolist() == [50, 60, -1, 15, 25, 35]
+    assert repeated.tolist() == [False, False, False, True, False, False]

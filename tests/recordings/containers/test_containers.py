@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
 
-from recordings.containers.container import LostMessage
+from recordings.containers.container import LostMessage, within
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
@@ -218,3 +218,9 @@ def test_a_bag_without_messages_is_refused(sample, tmp_path):
         path.write_bytes(content[:size])
         with pytest.raises(LogError, match=why):
             open_recording(without_index(path))
+
+
+def test_losses_outside_the_part_that_is_read_are_not_its_losses():
+    lost = [LostMessage(None, time, "broken") for time in (30, 10, 20)]
+    assert [item.log_time for item in within(lost, 10, 30)] == [10, 20]
+    assert [item.log_time for item in within(lost, None, None)] == [10, 20, 30]
