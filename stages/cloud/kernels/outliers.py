@@ -132,4 +132,5 @@ def supported_reference(
         present += np.isfinite(difference)
         agreeing += difference <= EXPLAINED * sigma * own**2 + slope * (k // 8 + 1)
     agreed = (present >= MIN_NEIGHBOURS) & (agreeing >= MIN_AGREEING_SHARE * present)
-    return chosen[near & agreed]  # type: ignore[no-any-return]
+    kept: Array = chosen[near & agreed]
+    return kept

@@ -247,7 +247,8 @@ def information_reference(image: Array, slopes: Array, noise: Array) -> Array:
     seen = (np.square(slopes.astype(np.float64)) - NOISE_GAIN * square) / (2 * GRADIENT_GAIN**2 * square)
     rows, cols = (np.arange(0, extent, BLOCK) for extent in image.shape)
     layers = np.stack([seen, np.ones_like(seen)])
-    return np.add.reduceat(np.add.reduceat(layers, rows, axis=1), cols, axis=2)
+    sums: Array = np.add.reduceat(np.add.reduceat(layers, rows, axis=1), cols, axis=2)
+    return sums
 
 
 def without_noise_reference(image: Array, variance: Array) -> Array:

@@ -216,7 +216,7 @@ def _join_runs(labels, rows, ends, parent):
             ends[run], parent[run] = x, run
             run += np.int64(row[x] != row[x - 1])
         ends[run], parent[run] = width, run
-        run += 1
+        run += np.int64(1)
         rows[y, 1] = run
         if y > 0:
             _join(labels, y, rows, ends, parent)
