@@ -94,9 +94,10 @@ class Container(ABC):
         return merge(found, lost, key=log_time_of) if lost else found
 
     def losses(self, channels: set[int]) -> list[LostMessage]:
-        """The damage, and the messages of some channels whose log time is damaged."""
+        """The damage of some channels or of unknown ones, and their messages whose log time is damaged."""
         why, untimed = "the message is lost: its log time is damaged", self.timeline.untimed
-        return self.lost + [LostMessage(channel, self.end, why) for channel in untimed if channel in channels]
+        found = [*self.lost, *(LostMessage(channel, self.end, why) for channel in untimed)]
+        return [item for item in found if item.channel is None or item.channel in channels]
 
     def heads(self, channels: set[int]) -> Iterator[RawMessage | LostMessage]:
         """At least the first bytes of the messages of `channels`, with their headers, in any order and not verified."""

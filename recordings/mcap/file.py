@@ -91,9 +91,9 @@ class McapFile(Container):
                 unknown = counted(counts[number], "message")
                 index.note_damage(f"{unknown} of channel {number} cannot be read: the log does not define it")
             for number, stated in sorted(index.stated_counts.items()):
-                if stated > counts.get(number, 0) and not self.lost:
-                    found = f"the log contains {counts.get(number, 0)}"
-                    index.note_damage(f"the log's statistics count {counted(stated, 'message')}, but {found}")
+                if stated > (count := counts.get(number, 0)) and all(item.channel is not None for item in self.lost):
+                    why = f"the log's statistics count {counted(stated, 'message')}, but the log contains {count}"
+                    self.lost.append(LostMessage(number, index.latest, why))
             check_size(self.path, self.size, sum(chunk.unpacked for chunk in index.chunks))
             self.timeline = Timeline.of(index.message_channels, index.message_times)
             self.start, self.end = self._ends()

@@ -61,8 +61,7 @@ def walk(file: BinaryIO, size: int) -> Index:
                 checksum = None if checksum is None else crc32(block[:taken], checksum)
                 position, before = position + taken, opcode
                 continue
-        is_record = opcode != Opcode.CHUNK or is_chunk(head)
-        if opcode == 0 or length > size - position - RECORD.size or not is_record:
+        if not _is_record(file, position, size, head):
             found = find_chunk(file, position + 1, size)
             _note_damage(index, file, position, found, size)
             if found is None:
@@ -83,6 +82,26 @@ def walk(file: BinaryIO, size: int) -> Index:
             checksum = crc32(content, crc32(head[: RECORD.size], checksum))
             checksum = _checksum(file, position + RECORD.size + len(content), length - len(content), checksum)
         position, before = position + RECORD.size + length, opcode
+
+
+def _is_record(file: BinaryIO, position: int, size: int, head: bytes) -> bool:
+    """Whether a record is within the file, and a chunk or a message index begins like one.
+
+    A message index that is longer than its list may be padded, or have a wrong length that hides the next chunk: then
+    no record of a data section begins after it.
+    """
+    opcode, length = RECORD.unpack_from(head) if len(head) >= RECORD.size else (0, 0)
+    after = position + RECORD.size + length
+    if opcode == 0 or after > size:
+        return False
+    if (
+        opcode == Opcode.MESSAGE_INDEX
+        and length >= 6
+        and struct.unpack_from("<I", head, RECORD.size + 2)[0] + 6 < length
+    ):
+        following, end = RECORD.unpack(read_at(file, after, RECORD.size)) if after + RECORD.size <= size else (0, 0)
+        return bool(0 < following <= Opcode.DATA_END and end <= size - after - RECORD.size)
+    return opcode != Opcode.CHUNK or is_chunk(head)
 
 
 def _checksum(file: BinaryIO, position: int, length: int, checksum: int) -> int:

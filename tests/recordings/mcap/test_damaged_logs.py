@@ -115,6 +115,7 @@ def test_messages_before_the_cut_in_a_chunk_are_rescued(sample, whole, tmp_path)
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(share=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 @example(share=0.8027289957765081, bit=0)  # a log time in the index, which no CRC covers
+@example(share=0.32102434907711075, bit=0)  # the length of a message index
 def test_a_flipped_bit_never_becomes_data(sample, whole, tmp_path, layout, share, bit):
     content = stored(sample, tmp_path, layout)
     place = int(share * len(content))
@@ -236,6 +237,22 @@ def test_statistics_without_channel_counts_do_not_mean_an_empty_log(sample, whol
     monkeypatch.setattr(Statistics, "write", lambda self, to: written(replace(self, channel_message_counts={}), to))
     path = rewrite(sample, tmp_path / "log.mcap", chunk_size=500)
     assert essences(items_of(path)) == essences(whole)
+
+
+def test_messages_that_only_the_statistics_count_are_losses_of_their_channel(sample, tmp_path, monkeypatch):
+    def more(self: Statistics, to: Any) -> None:
+        counts = {number: count + 2 for number, count in self.channel_message_counts.items()}
+        written(replace(self, channel_message_counts=counts), to)
+
+    written = Statistics.write
+    monkeypatch.setattr(Statistics, "write", more)
+    with McapFile(rewrite(sample, tmp_path / "log.mcap", chunk_size=500)) as log:
+        one, *_ = channels = sorted(log.channels)
+        for wanted in ({one}, set(channels)):
+            lost = [item for item in log.messages(wanted) if isinstance(item, LostMessage)]
+            assert {item.channel for item in lost} == wanted
+        count = log.count({one})
+        assert lost[0].reason == f"the log's statistics count {count + 2} messages, but the log contains {count}"
 
 
 @pytest.mark.parametrize("layout", ["small chunks", "no chunks", "no index", "no crcs"])
