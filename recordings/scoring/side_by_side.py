@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import heapq
+from collections import deque
 from collections.abc import Iterator
+from itertools import islice
 from operator import itemgetter
 from typing import Any
 
@@ -11,6 +13,7 @@ from recordings.ros2.from_msg import stamp_of
 from stages.data import LEVEL_FRAME
 
 MAX_DELAY = 5_000_000_000  # ns between the header stamps of messages that a log has in another order
+_AHEAD = 32  # messages, over two frames of the truth, among which one with a wrong later stamp does not count
 
 Messages = Iterator[tuple[str, int, Any]]  # topic, log time in ns, message
 
@@ -22,8 +25,8 @@ def frames(*logs: Messages) -> Iterator[tuple[int, dict[str, Any]]]:
     log by another clock.
     """
     waiting: dict[int, dict[str, Any]] = {}
-    for latest, topic, message in heapq.merge(*map(_stamped, logs), key=itemgetter(0)):
-        frame = waiting.setdefault(latest, {})
+    for latest, stamp, topic, message in heapq.merge(*map(_stamped, logs), key=itemgetter(0)):
+        frame = waiting.setdefault(stamp, {})
         frame[topic] = [*frame.get(topic, []), message] if topic == "/tf" else message
         for stamp in [stamp for stamp in waiting if stamp < latest - MAX_DELAY]:
             yield stamp, waiting.pop(stamp)
@@ -31,9 +34,15 @@ def frames(*logs: Messages) -> Iterator[tuple[int, dict[str, Any]]]:
         yield stamp, waiting.pop(stamp)
 
 
-def _stamped(messages: Messages) -> Iterator[tuple[int, str, Any]]:
-    """Header stamp, topic and message."""
-    for topic, _, message in messages:
-        for item in message.transforms if topic == "/tf" else (message,):
-            if topic != "/tf" or item.header.frame_id == LEVEL_FRAME:
-                yield stamp_of(item.header), topic, item
+def _stamped(messages: Messages) -> Iterator[tuple[int, int, str, Any]]:
+    """The first header stamp of a message and those ahead, and its own stamp, topic and message."""
+    items = (
+        (stamp_of(item.header), topic, item)
+        for topic, _, message in messages
+        for item in (message.transforms if topic == "/tf" else (message,))
+        if topic != "/tf" or item.header.frame_id == LEVEL_FRAME
+    )
+    ahead = deque(islice(items, _AHEAD))
+    while ahead:
+        yield min(stamp for stamp, _, _ in ahead), *ahead.popleft()
+        ahead.extend(islice(items, 1))

@@ -299,6 +299,16 @@ def test_log_times_do_not_change_the_score(tmp_path, truth, frames, topics, ahea
     assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
 
 
+@pytest.mark.parametrize("off", [3 * 3600, -3 * 3600])
+def test_a_wrong_stamp_in_the_truth_does_not_part_the_logs(tmp_path, truth, frames, off):
+    def wrong(index, message):
+        message.header.stamp.sec += off * (index == 0)
+
+    edit = edit_of("/truth/pose", "nav_msgs/msg/Odometry", wrong)
+    found = scored(tmp_path, rewrite(truth, tmp_path / "other.mcap", edit), frames)
+    assert (found.frames, found.compared, found.missing, found.unmatched) == (3, 2, {}, {})
+
+
 def without(truth, path, *topics):
     """The truth without the messages of some topics, but with their channels, as recorders write it."""
     return rewrite(truth, path, lambda topic, index, data: None if topic in topics else data, silent=True)
