@@ -245,10 +245,10 @@ class Recording:
         return Timeline(np.concatenate(channels), np.concatenate([timeline.log_times for timeline in timelines]))
 
     def _stamp_at(self, place: int) -> int:
-        """The header stamp of the message at a place; 0 if a damaged index gives it another log time."""
+        """The header stamp of the message at a place; 0 if it cannot be read."""
         number = int(np.searchsorted(self._firsts, place, "right")) - 1
         file, place = self.files[number], place - int(self._firsts[number])
         item = next(file.read(np.array([place])))
-        if isinstance(item, LostMessage) or item.log_time != file.timeline.log_times[place]:
+        if isinstance(item, LostMessage):
             return 0
         return peek_stamp(item.data, file.channels[item.channel].message_encoding)

@@ -138,7 +138,7 @@ def chunk_heads(file: BinaryIO, position: int, offsets: Sequence[int], size: int
 class ChunkTable:
     """Channel, log time and place of each message in records. Raises ValueError for a cut record, if not `is_cut`.
 
-    stated: the channels by the message index; a damaged one may have the messages in another order.
+    stated: channels and log times by the message index; a damaged one may have the messages in another order.
     """
 
     def __init__(self, records: Buffer, is_cut: bool = False, stated: NDArray[Any] | None = None) -> None:
@@ -162,11 +162,13 @@ class ChunkTable:
                 self.starts.append(start + MESSAGE.size)
                 self.ends.append(position)
         self._order: Sequence[int] = range(len(self.times))
-        if stated is not None and not np.array_equal(self.channels, stated):
-            own, other = (np.argsort(channels, kind="stable") for channels in (self.channels, stated))
-            if not np.array_equal(np.asarray(self.channels)[own], stated[other]):
+        found = np.array([self.channels, self.times], np.uint64)
+        if stated is not None and not np.array_equal(found, stated):
+            own, other = np.lexsort(found), np.lexsort(stated)
+            if np.array_equal(found[:, own], stated[:, other]):
+                self._order = own[np.argsort(other)].tolist()
+            elif not np.array_equal(found[0], stated[0]):
                 raise ValueError("its message index has other messages")
-            self._order = own[np.argsort(other)].tolist()
 
     def __len__(self) -> int:
         """The number of bytes."""

@@ -177,23 +177,26 @@ class McapFile(Container):
         return self._large[1]
 
     def _unpacked(self, chunk: StoredChunk) -> ChunkTable | str:
-        channels = self.timeline.channels[chunk.places.start : chunk.places.stop]
+        part, index = slice(chunk.places.start, chunk.places.stop), self.index
+        stated = np.array([index.message_channels[part], index.message_times[part]], np.uint64)
         try:
             records = memoryview(read_at(self._file, chunk.offset, min(chunk.length, MAX_CHUNK_BYTES)))
             if not chunk.is_bare:
                 if RECORD.unpack_from(records) != (int(Opcode.CHUNK), chunk.length - RECORD.size) and not chunk.is_cut:
                     raise ValueError("there is no chunk at the offset in the index")
                 records = memoryview((unpack_cut_chunk if chunk.is_cut else unpack_chunk)(records[RECORD.size :]))
-            return ChunkTable(records, chunk.is_cut, channels)
+            return ChunkTable(records, chunk.is_cut, stated)
         except PARSE_ERRORS as error:
             return lost_chunk(chunk.offset, error)
 
 
 def _message(chunk: ChunkTable | str, number: int, channel: int, log_time: int) -> RawMessage | LostMessage:
-    """A message of a chunk, with the log time that the chunk has, as no CRC covers that of the index; or its loss."""
+    """A message of a chunk, or its loss, also if the index has another log time: no CRC covers that."""
     if isinstance(chunk, str):
         return LostMessage(channel, log_time, chunk)
     found = RawMessage(channel, *chunk.message(number))
+    if found.log_time != log_time:
+        return LostMessage(channel, log_time, "the message is lost: its log time in the message index is wrong")
     if len(found.data) > MAX_STORED_BYTES:
         why = f"the message has {len(found.data)} bytes; the limit is {MAX_STORED_BYTES}"
         return LostMessage(channel, found.log_time, why)

@@ -43,6 +43,8 @@ from tests.recordings.sample_log import (
     sound,
 )
 
+TIMES = [1001, 1002, 1003, 1004]  # ns
+
 
 def record(opcode: int, content: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(content)) + content
@@ -369,15 +371,30 @@ def test_a_damaged_definition_in_a_cut_chunk_costs_its_chunk(tmp_path):
 
 
 def test_a_damaged_log_time_in_a_message_index_loses_no_message(tmp_path):
-    times = [1001, 1002, 1003, 1004]
-    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in times]
+    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in TIMES]
     log = write_mcap(tmp_path / "log.mcap", rows)
     content = bytearray(log.read_bytes())
     struct.pack_into("<Q", content, content.rindex(struct.pack("<Q", 1002)), 10**6)
     log.write_bytes(content)
     with McapFile(log) as file:
-        assert [message.log_time for message in file.messages(set(file.channels), 1001, 1004)] == times[:3]
+        assert [message.log_time for message in file.messages(set(file.channels), 1001, 1004)] == TIMES[:3]
         assert file.end == 1004
+
+
+@pytest.mark.parametrize(("place", "found", "why"), [
+    (0, [1001, 1003, 1004], ["the message is lost: its log time in the message index is wrong"]), (8, TIMES, []),
+])  # fmt: skip
+def test_wrong_entries_of_a_message_index_keep_the_order(tmp_path, place, found, why):
+    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in TIMES]
+    log = write_mcap(tmp_path / "log.mcap", rows)
+    content = bytearray(log.read_bytes())
+    at = content.rindex(struct.pack("<Q", 1002)) + place  # its log time, or its offset in the chunk
+    content[at : at + 2] = struct.pack("<H", 1003 if place == 0 else 10**4)
+    log.write_bytes(content)
+    with McapFile(log) as file:
+        items = list(file.messages(set(file.channels)))
+    assert [item.log_time for item in items if not isinstance(item, LostMessage)] == found
+    assert [item.reason for item in items if isinstance(item, LostMessage)] == why
 
 
 def test_stamps_of_zero_are_recognised_if_the_first_message_is_lost(sample, tmp_path):
