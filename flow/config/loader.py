@@ -73,7 +73,8 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:
-        raise UsageError(f"the pipeline {path} is not text; give {', '.join(shipped())} or a YAML file") from error
+        valid = ", ".join(shipped())
+        raise UsageError(f"the pipeline {path} is not text in UTF-8; give {valid} or a YAML file") from error
     except OSError as error:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
 

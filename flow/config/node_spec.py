@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import Field, dataclass, is_dataclass
+from importlib import import_module
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -14,6 +15,7 @@ from flow.parameters import coerced, is_required, parameters_of
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
 
+MODULES = ("flow.align", "stages", "recordings")  # whose classes a pipeline file names without a path of its own
 ROLES = {  # the attributes that a class of that role needs
     "source": ("streams", "open"),
     "sink": ("suffix", "wants", "open", "write", "close"),
@@ -122,10 +124,10 @@ def class_at(use: str, place: YamlLocation) -> type:
         __import__(module_name)  # it has no line of its own in a traceback, unlike importlib.import_module
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
-            raise place.error(f"cannot import '{module_name}': {error}") from error
+            raise place.error(f"cannot import '{module_name}': {error}{_meant(use)}") from error
         where = f"beside {place.file}" if place.line else "in the folder"
-        remedy = "set PYTHONPATH to its folder"
-        raise place.error(f"there is no module '{error.name}' {where} or on the Python path; {remedy}") from error
+        remedy = _meant(use) or "; set PYTHONPATH to its folder"
+        raise place.error(f"there is no module '{error.name}' {where} or on the Python path{remedy}") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise place.error(f"cannot import '{module_name}': {failure(error)}") from error
     module = sys.modules[module_name]
@@ -140,7 +142,12 @@ def class_at(use: str, place: YamlLocation) -> type:
         raise place.error(f"{use} is not a dataclass; {remedy}")
     listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
     known = [n for n in listed if is_dataclass(getattr(module, n, None))]
-    raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known)}")
+    raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known) or _meant(use)}")
+
+
+def _meant(use: str) -> str:
+    """The class of the product that is nearest to one that is not found, as the end of the sentence."""
+    return nearest(use, [f"{module}.{name}" for module in MODULES for name in import_module(module).__all__])
 
 
 def lacking(kind: type, role: str) -> list[str]:

@@ -11,14 +11,12 @@ from enum import IntEnum
 from importlib import import_module
 from typing import Any
 
-from flow.config.node_spec import ROLES, class_at, dataclass_of, lacking, type_name
+from flow.config.node_spec import MODULES, ROLES, class_at, dataclass_of, lacking, type_name
 from flow.contracts import nearest
 from flow.errors import UsageError
 from flow.parameters import is_required, parameters_of
 from flow.runtime.graph import YamlLocation, hints_of, is_aligner, ports_of
 from flow.units import as_written
-
-MODULES = ("flow.align", "stages", "recordings")  # whose classes a pipeline file names without a path of its own
 
 
 @dataclass(frozen=True)

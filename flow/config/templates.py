@@ -18,6 +18,7 @@ from flow.runtime.graph import TemplateUse, YamlLocation, ports_of
 
 SHIPPED = Path(__file__).parent.parent / "pipelines"
 _KEYS = ("inputs", "parameters", "output", "streams")
+MAX_STREAMS = 300  # of a pipeline
 
 
 @dataclass(frozen=True)
@@ -159,6 +160,8 @@ class Expansion:
     def _add(self, name: str, path: str, item: Value, scope: Scope | None = None, within: tuple[str, ...] = ()) -> None:
         """Add the stream `name`, or the streams of the template that it uses; within: the templates around it."""
         self._paths.append(path)
+        if len(self._paths) > MAX_STREAMS:
+            raise item.place.error(f"the pipeline has more than {MAX_STREAMS} streams; do templates multiply them?")
         changes = [change for change in self._left if change.target == path]
         self._left = [change for change in self._left if change.target != path]
         is_use = _is_use(item)

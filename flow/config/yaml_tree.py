@@ -12,7 +12,7 @@ import yaml
 from flow.contracts import nearest
 from flow.runtime.graph import YamlLocation
 
-MAX_VALUES = 100_000  # of a pipeline file
+MAX_TEXT, MAX_VALUES = 200_000, 100_000  # characters and values of a pipeline file
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,8 @@ def nearest_or_all(name: str, valid: Sequence[str]) -> str:
 
 def read(text: str, at: Callable[[int], YamlLocation]) -> Value:
     """YAML as values; at: the place of a line. Raises PipelineError for invalid YAML."""
+    if len(text) > MAX_TEXT:
+        raise at(1).error(f"too large for a pipeline file (limit: {MAX_TEXT} characters)")
     try:
         root = yaml.compose(text, Loader=yaml.SafeLoader)
         if root is not None and _size(root, {}) > MAX_VALUES:
@@ -67,7 +69,9 @@ def read(text: str, at: Callable[[int], YamlLocation]) -> Value:
         raise at(line).error(f"not valid YAML: the character #x{error.character:04x} is not allowed") from error
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise at(line).error(f"not valid YAML: {error.problem}") from error
+        begun = f", {error.context} from line {error.context_mark.line + 1} on" if error.context_mark else ""
+        remedy = "check indentation (spaces, no tabs), brackets and quotes up to here"
+        raise at(line).error(f"not valid YAML: {error.problem}{begun}; {remedy}") from error
 
 
 def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.SafeLoader) -> Value:
@@ -86,7 +90,9 @@ def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.Sa
     if isinstance(node, yaml.SequenceNode):
         return Value([_located(item, at, loader) for item in node.value], place)
     try:
-        return Value(loader.construct_object(node), place)
+        value = loader.construct_object(node)
+        str(value)  # no message can contain a whole number of thousands of digits
+        return Value(value, place)
     except (AttributeError, LookupError, ValueError) as error:  # in the form of a type, but no such value
         kind = node.tag.rpartition(":")[2]
         raise place.error(f"{reprlib.repr(node.value)} looks like a YAML {kind} but is none; quote it") from error

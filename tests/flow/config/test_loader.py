@@ -133,6 +133,9 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("stream: level, at: both", "stream: level, at: right", 6, ["different clocks", "align them first"]),
     ("toys.Scale", "toys.Scael", 5, ["no dataclass 'Scael'", "did you mean 'Scale'"]),
     ("flow.toys.Scale", "flaw.toys.Scale", 5, ["cannot import 'tests.flaw.toys'"]),
+    ("tests.flow.toys.Scale", "stage.Clean", 5, ["no module 'stage'", "did you mean 'stages.Clean'?"]),
+    ("tests.flow.toys.Scale", "stages.matching.Match", 5, ["no dataclass 'Match'; did you mean 'stages.Match'?"]),
+    ("flow.align.pair", "flow.aline.pair", 3, ["cannot import 'flow.aline'", "did you mean 'flow.align.pair'?"]),
     ("toys.Add, a: twice, b: height", "toys.Mute, a: twice", 6, ["does not say the type of its input 'a'"]),
     ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
     ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
@@ -144,10 +147,13 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("  both:", "  left:", 3, ["'left' is already a stream of the source"]),
     ("  sum: ", "  both:", 6, ["'both' is here twice"]),
     ("  - {use", "  - {use: [", 8, ["not valid YAML"]),
+    ("5 ms}", "5 ms", 4, ["not valid YAML: ", "a flow mapping from line 3 on; check indentation"]),
     ("2.5}", "2\x01}", 1, ["not valid YAML: the character #x0001"]),
     ("[1, 2.5]", "[" * 3000, 1, ["nested too deep"]),
     ("2.5}", f"{10**400}}}", 1, ["gain: int too large"]),
     ("2.5}", f"1{'0' * 5000}}}", 1, ["looks like a YAML int but is none; quote it"]),
+    ("2.5}", f"0x{'f' * 5000}}}", 1, ["looks like a YAML int but is none; quote it"]),
+    ("sinks:", f"# {'x' * 200_000}\nsinks:", 1, ["too large for a pipeline file (limit: 200000 characters)"]),
     ("25 cm", "2001-99-99", 5, ["'2001-99-99' looks like a YAML timestamp but is none; quote it"]),
     ("  twice:", "  my-twice:", 5, ["'my-twice' cannot name a stream"]),
     ("  twice:", "  yes:", 5, ["'yes' is not a name", "quoted"]),
@@ -307,5 +313,5 @@ def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, t
 
 def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
     (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
-    with pytest.raises(UsageError, match=r"t.mcap is not text; give accurate, fast, paper, rover or a YAML file"):
+    with pytest.raises(UsageError, match=r"t.mcap is not text in UTF-8; give accurate, fast, .*or a YAML file"):
         load(str(tmp_path / "t.mcap"))

@@ -219,3 +219,12 @@ def test_the_command_line_sets_parameters_of_sinks():
     graph = load("rover", ["McapSink.compression=zstd", "McapSink.also=[disparity/full]"])
     sink: Any = dict(graph.sinks)["recordings.McapSink"]
     assert (sink.compression, sink.also) == ("zstd", ("disparity/full",))
+
+
+@pytest.mark.parametrize("uses", ["a: {template: t%d}, b: {template: t%d}", "a: {template: t%d}"])
+def test_templates_that_multiply_or_nest_streams_endlessly_are_refused(tmp_path, uses):
+    inner = [uses.replace("%d", str(number + 1)) for number in range(400)]
+    templates = "".join(f"  t{number}: {{output: a, streams: {{{used}}}}}\n" for number, used in enumerate(inner))
+    text = TOY.replace("source: {use", f"{templates}source: {{use", 1)
+    text = text.replace("sinks:", "  more: {template: t0}\nsinks:")
+    assert "the pipeline has more than 300 streams" in refusal(tmp_path, text)
