@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -82,6 +83,7 @@ class DecodedTopics:
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
         self._ahead: dict[str, int] = {}
+        self._last: tuple[bytes | memoryview, Any] = b"", None  # data and message
         weights, unpacking, dense = dict[MessageSchema, int](), Unpacking(), self._dense_topics(max_rate)
         for place, (number, channel) in enumerate(file.channels.items()):
             if place >= MAX_CHANNELS:
@@ -94,9 +96,17 @@ class DecodedTopics:
                     raise LogError(dense[channel.topic])
                 if sum(weights.values()) > MAX_SCHEMA_BYTES:
                     raise LogError(f"the schemas of the log have more than {MAX_SCHEMA_BYTES} bytes")
-                self.schemas[channel.topic], self.decoders[number] = decoder_of(channel, unpacking)
+                self.schemas[channel.topic], decode = decoder_of(channel, unpacking)
+                self.decoders[number] = partial(self._decoded, decode)
             except LogError as error:
                 self.undecodable_channels[number] = str(error)
+
+    def _decoded(self, decode: Decoder, data: bytes | memoryview) -> Any:
+        """A message. The last one is kept, as some are decoded for their stamp, and then for their content."""
+        last = self._last
+        if last[0] is not data:
+            self._last = last = data, decode(data)
+        return last[1]
 
     def _dense_topics(self, max_rate: int) -> dict[str, str]:
         """The topics with more messages in a time than any sensor has -> a sentence."""

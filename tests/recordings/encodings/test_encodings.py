@@ -3,6 +3,7 @@
 import json
 import re
 import struct
+from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +20,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from recordings import McapSource
 from recordings.containers.container import Channel, MessageSchema
+from recordings.encodings import decoding
 from recordings.encodings.decoding import MAX_MESSAGE_BYTES, decoder_of
 from recordings.encodings.json_text import json_decoder
 from recordings.errors import LogError
@@ -30,8 +32,8 @@ from recordings.ros2.to_msg import camera_info, image
 from recordings.source.topics import MAX_CHANNELS
 from stages.data import Tilt
 from tests.conftest import write_mcap
-from tests.recordings.encodings.rewritten import ROS1, WRITERS, as_ros1
-from tests.recordings.sample_log import essences, items_of, model
+from tests.recordings.encodings.rewritten import ROS1, WRITERS, as_ros1, json_log
+from tests.recordings.sample_log import FRAMES, essences, items_of, model
 
 NOTHING = f"c/E[{{}}] x\n{'=' * 80}\nMSG: c/E\n"
 
@@ -48,6 +50,21 @@ def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_
         stamps.append([item.stamp for _, stream, item in items_of(log, start=0.15) if stream == "left"])
     assert len(stamps[0]) == 3
     assert all(others == stamps[0] for others in stamps)
+
+
+def test_an_image_in_json_is_decoded_once_also_in_a_part_of_a_log(sample, tmp_path, monkeypatch):
+    decoded = Counter()
+
+    def counting(data):
+        decoded[bytes(data)] += 1
+        return json_decoder(data)
+
+    monkeypatch.setattr(decoding, "json_decoder", counting)
+    with McapSource().open(json_log(sample, tmp_path / "log.mcap"), end=9.0) as log:
+        list(log.events(["left", "right"]))  # also looks at the last ones, to compare clocks
+        decoded.clear()
+        list(log.events(["left", "right"]))
+    assert [number for data, number in decoded.items() if b'"step"' in data] == [1] * 2 * FRAMES
 
 
 def json_angles(path: Path, angles: list[dict[str, Any]], schema: bool) -> Path:
