@@ -15,6 +15,8 @@ from os.path import samestat
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from recordings.atomic_write import temporary_name, writing
 from recordings.containers.container import Channel, RawMessage
 from recordings.errors import LogError, UnwritableError
@@ -44,9 +46,10 @@ class ResumableWriter(Ros2Writer):
             topics = {channel.topic: log.channels_of([channel.topic]) for channel in log.channels.values()}
             self.contained = {topic: set(log.times(channels).tolist()) for topic, channels in topics.items()}
             self._channels_before = log.channels
-            cut = next((chunk.places.start for chunk in log.index.chunks if chunk.is_cut), len(log.timeline))
+            whole = [place for chunk in log.index.chunks if not chunk.is_cut for place in chunk.places]
             places = log.timeline.chosen(set(log.channels), None, None)
-            self._groups = groupby(log.read(places[places < cut]), attrgetter("log_time"))  # a CRC covers each
+            places = places[np.isin(places, whole)]  # a CRC covers each
+            self._groups = groupby(log.read(places), attrgetter("log_time"))
 
     def skip(self, topic: str, stamp: int) -> bool:
         """Copy a message of the unfinished log; False if it is not there. The stamps must ascend."""

@@ -13,6 +13,7 @@ import yaml
 
 from recordings.importers import recording
 from recordings.importers.files import read_bytes
+from recordings.mcap.file import McapFile
 from recordings.mcap.resumable import ResumableWriter
 from tests.conftest import roverflow, slow
 from tests.limits import file_size_limited
@@ -122,6 +123,19 @@ def test_wherever_the_log_was_cut_or_damaged_the_result_is_the_same(source, inte
             interrupted.write_bytes(content)
             assert roverflow(*importing(source, out)) == 0
             assert out.read_bytes() == whole, place
+
+
+def test_a_chunk_of_wrong_length_costs_only_its_own_images(source, interrupted, logged):
+    with McapFile(interrupted) as log:
+        (right,) = (number for number, channel in log.channels.items() if channel.topic.startswith("/stereo/right/im"))
+        second = np.flatnonzero(log.timeline.channels == right)[1]
+        (chunk,) = (chunk for chunk in log.index.chunks if second in chunk.places)
+    content, out = bytearray(interrupted.read_bytes()), interrupted.with_name("out.mcap")
+    content[chunk.offset + 7] ^= 1  # of the length, which is now beyond the end of the log
+    interrupted.write_bytes(content)
+    assert roverflow(*importing(source, out)) == 0
+    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    assert [name for name in logged if name[0] in "012"] == ["1-right.png"]
 
 
 def test_an_import_that_is_killed_again_loses_nothing_of_the_first_one(source, tmp_path, said, logged):
