@@ -151,7 +151,8 @@ class Canvas:
         self, path: str, text: str, level: rr.TextLogLevel = rr.TextLogLevel.INFO, at: At | None = None
     ) -> None:
         """A text in lines that the ledger has room for. at: the frame's time by default."""
-        for line in wrap(text, LEDGER_CHARS, subsequent_indent="... ", break_long_words=False, break_on_hyphens=False):
+        limits: dict[str, Any] = {"subsequent_indent": "... ", "break_long_words": False, "break_on_hyphens": False}
+        for line in (part for own in text.splitlines() for part in wrap(own, LEDGER_CHARS, **limits)):
             self.rows.add(path, at or self.at, drawn(rr.TextLog, text=line, level=level).components)
 
     def log_change(self, path: str, text: str, level: rr.TextLogLevel) -> None:
@@ -274,7 +275,7 @@ class Canvas:
 
     def log_distances(self, path: str, shape: tuple[int, int], grid: ElevationMap | NavigationMap) -> None:
         """Lines across a bird's-eye view at every second metre of x, with distances; the rover's place and way."""
-        lines, marks = _distances(shape, grid.origin, grid.resolution, colormaps.rover_place(grid))
+        lines, marks = _distances(shape, (*grid.origin,), grid.resolution, colormaps.rover_place(grid))
         self.log_components(path, lines.kind, recurring=lines.components)
         self.log_components(f"{path}/distances", marks.kind, recurring=marks.components)
         ways = colormaps.way_on(grid, shape, self.ways.get(grid.frame_id, []))

@@ -44,10 +44,14 @@ def known_cells(grid: ElevationMap | NavigationMap) -> Array:
 
 
 def ahead(grid: _Map) -> _Map:
-    """A map without the columns farther than `METRES_BEHIND` behind its origin, if nothing is known of them."""
+    """A map without the columns farther than `METRES_BEHIND` behind its origin, if nothing is known of them.
+
+    A map that lies farther behind stays whole.
+    """
     columns = max(0, round((-METRES_BEHIND - grid.origin[0]) / grid.resolution))
     known = grid.cells != Cell.UNKNOWN if isinstance(grid, NavigationMap) else np.isfinite(grid.layers["elevation"])
-    found: _Map = grid if known[:, :columns].any() else _part(grid, slice(0, None), slice(columns, None))
+    whole = columns >= known.shape[1] or known[:, :columns].any()
+    found: _Map = grid if whole else _part(grid, slice(0, None), slice(columns, None))
     return found
 
 

@@ -215,7 +215,8 @@ class RerunRecording:
         last = {_shown(stream, item): stream for stream, item in present.items()}
         captions = []
         for stream, item in present.items():
-            if last[_shown(stream, item)] != stream:
+            later = last[_shown(stream, item)]
+            if later != stream and getattr(item, "layers", {}).keys() <= getattr(present[later], "layers", {}).keys():
                 continue
             if (kind := type(item)) not in self._loggers:
                 fitting = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and issubclass(kind, kinds[0])]
@@ -294,7 +295,7 @@ def _last_of(kind: type, items: Mapping[str, Any]) -> list[str]:
 
 
 def _shown(stream: str, item: Any) -> Hashable:
-    """What a picture of an item shows. Of streams that show the same the last one is drawn.
+    """What a picture of an item shows. Of streams that show the same the last one is drawn, and layers that it lacks.
 
     That is stereo with the same pixels, as in a log that is rectified already; an elevation map with the same heights,
     to which later stages add layers; the very same pose.

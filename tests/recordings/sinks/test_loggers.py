@@ -112,11 +112,12 @@ def test_what_a_later_stream_shows_too_is_drawn_once(tmp_path):
         "raw": StereoFrame(START, frame.left.copy(), frame.right, frame.camera), "stereo": frame, "rectified": frame,
         "logged": pose, "pose": pose, "cells": replace(terrain, layers={"elevation": heights}),
         "other": replace(terrain, layers={"elevation": heights + np.float32(1)}), "elevation_map": terrain,
+        "heights": replace(terrain, layers={"elevation": heights}),  # without a layer of the one before
     }  # fmt: skip
     streams = {name: type(item) for name, item in shown.items()}
     drawn = entities(record_of(tmp_path / "run.rrd", [Record(START, shown)], streams=streams))
     assert {entity.split("/")[1] for entity in drawn} & shown.keys() == {
-        "raw", "rectified", "pose", "other", "elevation_map"
+        "raw", "rectified", "pose", "other", "elevation_map", "heights"
     }  # fmt: skip
 
 

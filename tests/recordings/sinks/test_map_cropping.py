@@ -77,3 +77,8 @@ def test_unknown_ground_behind_the_rover_is_not_drawn(behind):
     assert ahead(terrain).origin == ahead(cells).origin == pytest.approx((-2.0 + left_out * STEP, -3.0))
     np.testing.assert_array_equal(ahead(terrain).layers["count"], terrain.layers["count"][:, left_out:])
     np.testing.assert_array_equal(ahead(cells).reason, cells.reason[:, left_out:])
+
+
+def test_a_map_far_behind_its_origin_without_known_cells_stays_whole():
+    for item in maps(np.zeros((4, 80), bool)).values():
+        assert ahead(replace(item, origin=(-9.0, 0.0))).origin == (-9.0, 0.0)

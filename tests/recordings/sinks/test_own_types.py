@@ -183,11 +183,11 @@ def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
 def test_own_types_are_drawn_field_by_field(tmp_path):
     path = tmp_path / "own.rrd"
     kinds = {"own/report": Report, "level": int, "note": str}
-    found = drawn(path, kinds, {"own/report": report(), "level": 3, "note": "dry"})
+    found = drawn(path, kinds, {"own/report": report(), "level": 3, "note": "dry\n  soft"})
     own = {entity.removeprefix("/own/report/") for entity in found if entity.startswith("/own/report/")}
     assert own >= {"blur", "mask", "corners", "histogram", "text", "by_side/2", "disparity/pixels", "range_m"}
     assert rows(path, "/level", "Scalars:scalars")[0][2] == [3.0]
-    assert rows(path, "/note", "TextLog:text")[0][2] == ["dry"]
+    assert [value for *_, value in rows(path, "/note", "TextLog:text")] == [["dry"], ["  soft"]]
     mask = decoded(rows(path, "/own/report/mask", "EncodedImage:blob")[0][2][0], cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(mask, 255 * np.eye(4, 5))
 
