@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from types import MappingProxyType
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -49,6 +48,18 @@ class MatchFailure(IntEnum):
     BURNT_OUT = 2
     BARE = 3  # without contrast
     OTHER = 4  # seen by one camera, repetitive, reflecting
+
+
+class _Layers(dict[str, Array]):
+    """A dict that cannot be changed; pickles and copies of it can."""
+
+    def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
+        raise TypeError("the layers of an ElevationMap are read-only; make another map with dataclasses.replace")
+
+    __setitem__ = __delitem__ = __ior__ = update = setdefault = pop = popitem = clear = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return dict, (dict(self),)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +106,13 @@ class ElevationMap:
         for name, layer in layers.items():
             if layer.shape != (rows, cols) or layer.dtype != np.float32:
                 raise StageError(f"ElevationMap layer '{name}' must be float32 ({rows}, {cols})")
-        object.__setattr__(self, "layers", MappingProxyType({n: read_only(layer) for n, layer in layers.items()}))
+        object.__setattr__(self, "layers", _Layers({n: read_only(layer) for n, layer in layers.items()}))
         object.__setattr__(self, "shape", (rows, cols))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickled and copied by its fields, as the read-only mapping cannot be."""
-        layers = dict(self.layers)
-        return type(self), (self.stamp, layers, self.resolution, self.origin, self.frame_id, self.level, self.epoch)
+        """Pickled and copied by its fields, so that its arrays are read-only again."""
+        fields = self.stamp, self.layers, self.resolution, self.origin, self.frame_id, self.level, self.epoch
+        return type(self), fields
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 import copy
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -50,7 +50,7 @@ def test_the_maker_of_an_array_cannot_change_it_once_published():
     for array in (pixels, layer, terrain.layers["elevation"]):
         with pytest.raises(ValueError, match="read-only"):
             array[0, 0] = 1
-    with pytest.raises(TypeError):
+    with pytest.raises(TypeError, match=r"read-only; make another map with dataclasses\.replace"):
         terrain.layers["other"] = FLAT  # type: ignore[index]
 
 
@@ -74,6 +74,12 @@ def test_an_elevation_map_is_pickled_and_copied(copied):
     for name, layer in found.layers.items():
         np.testing.assert_array_equal(layer, layers[name])
         assert not layer.flags.writeable
+
+
+def test_the_fields_of_an_elevation_map_are_a_dict_by_asdict():
+    given = ElevationMap(7, {"elevation": FLAT}, 0.1, (1.0, 2.0), "odom")
+    found = asdict(replace(given, stamp=8))
+    assert (found["stamp"], found["shape"], found["layers"].keys()) == (8, FLAT.shape, {"elevation"})
 
 
 def test_small_arrays_are_copied():
