@@ -6,7 +6,7 @@ import inspect
 import pickle
 import re
 from dataclasses import Field, dataclass
-from typing import Any
+from typing import Any, Self
 
 from flow.contracts import StageError
 from flow.parameters import Checked
@@ -22,6 +22,14 @@ class Stage(Checked):
 
     The docstring of a subclass gets a section Parameters, made from all fields, for `help()`.
     """
+
+    def __new__(cls, *given: Any, **named: Any) -> Self:
+        """Raises StageError where an input of the work is given instead of parameters."""
+        if any(hasattr(item, "stamp") for item in (*given, *named.values())):
+            _, *ports = inspect.signature(cls.__call__).parameters.values()
+            needed = ", ".join(port.name for port in ports if port.default is port.empty)
+            raise StageError(f"{cls.__name__} takes parameters; use {cls.__name__}()({needed})")
+        return super().__new__(cls)
 
     def __init_subclass__(cls) -> None:
         known = {**getattr(cls, "__dataclass_fields__", {}), **vars(cls)}  # inherited ones first

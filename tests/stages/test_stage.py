@@ -7,6 +7,7 @@ import pytest
 
 import stages
 from flow.config.reference import stage_reference
+from flow.contracts import StageError
 from stages import CameraModel, StereoCamera, StereoFrame
 from stages.stage import Stage
 from tests.stages.builders import cloud_of, disparity_of
@@ -70,3 +71,15 @@ TIMES = "frame of 7 ns, disparity of 8 ns: join data"
 def test_inputs_that_do_not_belong_together_are_refused(stage, inputs, message):
     with pytest.raises(ValueError, match=message):
         stage(*inputs)
+
+
+@pytest.mark.parametrize(("make", "call"), [
+    (lambda: stages.Match(FRAME), "Match takes parameters; use Match()(frame)"),
+    (lambda: stages.Match(frame=FRAME), "Match takes parameters; use Match()(frame)"),
+    (lambda: stages.Halve(FRAME), "Halve takes parameters; use Halve()(frame)"),
+    (lambda: stages.Upsample(FRAME, disparity()), "Upsample takes parameters; use Upsample()(frame, disparity)"),
+])  # fmt: skip
+def test_a_stage_that_gets_its_input_as_a_parameter_says_how_to_call_it(make, call):
+    with pytest.raises(StageError) as raised:
+        make()
+    assert str(raised.value) == call
