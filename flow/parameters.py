@@ -131,7 +131,8 @@ def coerced(value: Any, kind: Any, known: Field[Any]) -> Any:
         return _number(value, kind, known)
     plain = origin or kind
     if not isinstance(value, plain):
-        raise ValueError(f"expected {_WORDS.get(plain, plain.__name__)}, not {value!r}")
+        wanted = "a mapping" if is_dataclass(plain) else _WORDS.get(plain, plain.__name__)
+        raise ValueError(f"expected {wanted}, not {value!r}")
     check(value, known)
     return value
 
@@ -150,7 +151,7 @@ def _number(value: Any, kind: type, known: Field[Any]) -> float | int:
         value = quantity(value, unit)
         if kind is int and float(value).is_integer():
             value = int(value)
-    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+    elif isinstance(value, int | float) and not isinstance(value, bool):
         check_bare(value, unit)
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]

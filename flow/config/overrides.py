@@ -100,7 +100,7 @@ def _unknown(change: Change, streams: Mapping[str, Value], parts: Iterable[str],
         return f"write the stream in place of its class '{target}': {' or '.join(of_class)}"
     if keys:
         return f"there is no stream '{target}'{nearest(target, [*entries, *settings])}"
-    if target in entries:
+    if target in entries or "/" in target:
         return f"name the parameter of '{target}', as in {target}.parameter=value{nearest(target, settings)}"
     return f"the pipeline has no setting '{target}'{nearest_or_all(target, [*settings])}"
 
@@ -116,7 +116,7 @@ def _with_value(item: Value, what: str, keys: Sequence[str], value: Value) -> Va
     if not keys:
         return value
     if not isinstance(item.value, dict):
-        raise value.place.error(f"'{what}' is not a mapping")
+        raise value.place.error(f"'{what}' is {item.plain()!r}, not a mapping with '{keys[0]}'")
     inner = item.value.get(keys[0], Value({}, value.place))
     changed = _with_value(inner, f"{what}.{keys[0]}", keys[1:], value)
     return Value({**item.value, keys[0]: changed}, value.place)

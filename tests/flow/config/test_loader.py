@@ -216,10 +216,17 @@ def test_a_setting_is_filled_in_wherever_it_is_named(tmp_path):
     (SETTINGS.replace("settings", "setings"), [], r"toy.yaml:1: a pipeline has no 'setings'; did you mean 'settings'"),
     (SETTINGS.replace("{stretch: 25 cm}", "{stretch: $other, other: 1 m}"), [], r"toy.yaml:1: .*'stretch' refers"),
     ("settings: 3\n" + GOOD, [], r"toy.yaml:1: 'settings' must be a mapping"),
+    (SETTINGS, ["stretch.sign=1"], r"--set stretch.sign=1: 'stretch' is '25 cm', not a mapping with 'sign'"),
+    (SETTINGS, ["stretch=1e400"], r"--set stretch=1e400: .*Scale.factor: must be a finite number in m, not 1e400"),
 ])  # fmt: skip
 def test_an_invalid_setting_is_named(tmp_path, text, overrides, message):
     with pytest.raises((PipelineError, UsageError), match=message):
         loaded(tmp_path, text, overrides=overrides)
+
+
+def test_a_mapping_that_is_needed_cannot_be_null():
+    with pytest.raises(PipelineError, match=r"--set rover=null: stages.TerrainFeatures.rover: expected a mapping, not"):
+        load("rover", ["rover=null"])
 
 
 @pytest.mark.parametrize("setting", [

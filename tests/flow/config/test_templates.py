@@ -166,6 +166,7 @@ def test_a_template_that_uses_itself_is_refused(tmp_path):
     ("out.second=1 s", "tests.flow.toys.Scale.factor: '1 s' is a time"),
     ("out/first.factor=1", "tests.flow.toys.Scale.factor: 1 needs a unit"),
     ("out=1", "name the parameter of 'out', as in out.parameter=value"),
+    ("out/first=1", "name the parameter of 'out/first', as in out/first.parameter=value"),
 ])  # fmt: skip
 def test_a_bad_setting_of_a_template_is_named(tmp_path, override, message):
     assert refusal(tmp_path, overrides=[override]).startswith(f"--set {override}: {message}")
