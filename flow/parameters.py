@@ -151,7 +151,7 @@ def _number(value: Any, kind: type, known: Field[Any]) -> float | int:
         value = quantity(value, unit)
         if kind is int and float(value).is_integer():
             value = int(value)
-    elif isinstance(value, int | float) and not isinstance(value, bool):
+    elif isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
         check_bare(value, unit)
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         wanted = {"int": "a whole number", "float": "a number"}[kind.__name__]
