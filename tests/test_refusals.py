@@ -189,7 +189,7 @@ def test_a_log_given_twice_is_one_log(traverse, fast_result, tmp_path):
     assert out.read_bytes() == fast_result.read_bytes()
 
 
-SIZE = "must be a number above 0 with MB, GB or TB, such as 4GB, not"
+SIZE = "must be a number with MB, GB or TB, at least 500MB, such as 4GB, not"
 SECONDS = "must be seconds after the log's first message"
 
 
@@ -200,7 +200,7 @@ SECONDS = "must be seconds after the log's first message"
     ("--every", "0", "must be a whole number of frames of at least 1, such as 2, or a length above 0 m, such as 0.5m"),
     ("--every", "infm", "not 'infm'"),
     *(("--start", odd, SECONDS) for odd in ("nan", "inf", "-1", "soon")),
-    *(("--memory", odd, f"{SIZE} '{odd}'") for odd in ("lots", "4", "0GB", "-1GB", "GB")),
+    *(("--memory", odd, f"{SIZE} '{odd}'") for odd in ("lots", "4", "0GB", "-1GB", "GB", "499MB")),
 ])  # fmt: skip
 def test_an_impossible_number_is_refused(traverse, tmp_path, option, value, printed, capsys):
     command = ("fleet", traverse, "--out") if option == "--memory" else ("run", traverse, "-o")
@@ -271,10 +271,14 @@ def test_angles_of_an_absent_field_are_refused_before_the_run(traverse, tmp_path
     assert not list(tmp_path.iterdir())
 
 
-def test_a_pipe_is_refused(tmp_path, refused):
+@pytest.mark.parametrize("command", [
+    "run", "info", "report", "diff PIPE", "try --at 0 --set a=1 --result PIPE", "desk",
+])  # fmt: skip
+def test_a_pipe_is_refused(tmp_path, refused, command):
     os.mkfifo(tmp_path / "pipe")
-    for command in (("run", tmp_path / "pipe", "-o", tmp_path / "out.mcap"), ("info", tmp_path / "pipe")):
-        assert "pipe is a pipe or a device; give a log" in refused(*command)
+    words = command.replace("PIPE", str(tmp_path / "pipe")).split()
+    what = "a recording" if command == "desk" else "a log"
+    assert f"pipe is a pipe or a device; give {what}" in refused(*words, tmp_path / "pipe")
 
 
 @pytest.mark.parametrize(("settings", "printed"), [
@@ -339,6 +343,21 @@ def test_an_unknown_pipeline_is_answered_with_templates_too(refused):
         "roverflow: no pipeline or template 'rover_disparty': neither a file nor one of accurate, "
     )
     assert printed.endswith("match_right, rover_disparity; did you mean 'rover_disparity'?\n")
+
+
+def test_a_file_that_is_no_text_is_no_pipeline_to_print(tmp_path, refused):
+    (tmp_path / "a.png").write_bytes(b"\x89PNG")
+    assert "a.png is not text in UTF-8; give accurate, fast, paper, rover or a YAML file" in refused(
+        "pipeline", tmp_path / "a.png"
+    )
+
+
+@pytest.mark.parametrize(("options", "printed"), [
+    ("--fixes a.mcap", "--fixes needs --crs, such as --crs utm"),
+    ("--merge --crs utm", "--merge merges regional maps in their own frame; leave out --frames, --map and --crs"),
+])  # fmt: skip
+def test_options_that_an_export_would_not_use_are_refused(result, tmp_path, refused, options, printed):
+    assert printed in refused("export", result, tmp_path / "maps", *options.split())
 
 
 def test_an_output_needs_the_ending_of_its_kind(traverse, fast_result, tmp_path, refused):

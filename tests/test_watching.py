@@ -19,8 +19,9 @@ FRAME_BYTES = 100_000  # fewer than a frame of the traverse has in the recording
 
 
 def test_watching_needs_the_recording(traverse, tmp_path, refused):
-    why = refused("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", "--view")
-    assert "--view and --serve need the recording; leave out --no-rrd" in why
+    for option in (["--view"], ["--desk", "tilt"]):
+        why = refused("run", traverse, *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd", *option)
+        assert "--view, --serve and --desk need the recording; leave out --no-rrd" in why
 
 
 def check_same(out, result):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     At = float | str | np.datetime64 | np.timedelta64
 
 _MAX_WORKERS = 1024
+_MIN_MEMORY_MB = 500
 _MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
 AT = "seconds after the log's first message, a time copied from the viewer, or cursor: the time in the open viewer"
 CURSOR = "cursor"  # the instant of a viewer that is open
@@ -41,9 +42,11 @@ def workers(text: str) -> int:
 
 
 def memory(text: str) -> str:
-    """An amount of memory, as Dask reads it."""
-    if not re.fullmatch(r"\d*\.?\d+ ?[MGT]i?B", text) or not float(re.split("[ MGT]", text)[0]):
-        raise argparse.ArgumentTypeError(f"must be a number above 0 with MB, GB or TB, such as 4GB, not '{text}'")
+    """An amount of memory, as Dask reads it; with less than 500 MB a worker process ends before its first frame."""
+    found = re.fullmatch(r"(\d*\.?\d+) ?([MGT])i?B", text)
+    if not found or float(found[1]) * {"M": 1, "G": 1e3, "T": 1e6}[found[2]] < _MIN_MEMORY_MB:
+        least = f"at least {_MIN_MEMORY_MB}MB"
+        raise argparse.ArgumentTypeError(f"must be a number with MB, GB or TB, {least}, such as 4GB, not '{text}'")
     return text
 
 

@@ -56,7 +56,7 @@ def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> G
         If there is no such file.
     """
     path = pipeline_file(name)
-    text = _text(path)
+    text = pipeline_text(path)
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # so that stages can be beside the file that uses them
     tree = read(text, lambda line: YamlLocation(path.name, line))
@@ -69,7 +69,8 @@ def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> G
     return _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)
 
 
-def _text(path: Path) -> str:
+def pipeline_text(path: Path) -> str:
+    """The text of a pipeline file."""
     try:
         return path.read_text(encoding="utf-8")
     except UnicodeDecodeError as error:

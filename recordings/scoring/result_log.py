@@ -25,6 +25,8 @@ _UNREADABLE = (McapError, OSError, ValueError, struct.error, MemoryError, Overfl
 
 def about_run(result: Path) -> dict[str, str]:
     """The facts of the run that wrote a result log; empty for another log."""
+    if not result.is_file():  # a pipe would never open
+        return {}
     with suppress(*_UNREADABLE), result.open("rb") as file:
         *_, record = islice(StreamReader(file, emit_chunks=True).records, 2)  # the header and the first metadata record
         if isinstance(record, Metadata) and record.name == "roverflow":

@@ -17,6 +17,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TextLogColumnKind, TimelineColumn
 
+from recordings.containers.finding import first_bytes
 from recordings.errors import LogError
 from stages.data import LEVEL_FRAME
 
@@ -106,10 +107,7 @@ class Layout:
 
 def read_layout(recording: Path) -> Layout:
     """The layout that a recording of `RerunSink` keeps. Raises LogError."""
-    try:
-        recording.open("rb").close()
-    except OSError as error:
-        raise LogError(f"cannot read {recording}: {error.strerror or error}") from error
+    first_bytes(recording, "a recording")  # refuses what is no file, or empty
     try:
         for chunk in rr.chunk.RrdReader(str(recording)).stream():
             if chunk.entity_path == f"/{LAYOUT}":

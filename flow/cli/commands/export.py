@@ -38,6 +38,8 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Write the files."""
     results = _results(options)
+    if options.fixes and not options.crs:
+        raise UsageError("--fixes needs --crs, such as --crs utm")
     if options.folder.exists() and not options.folder.is_dir():
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
@@ -95,8 +97,8 @@ def _results(options: argparse.Namespace) -> list[Path]:
         if len(options.results) > 1:
             raise UsageError("export takes one result log and a folder; add --merge to merge the maps of several logs")
         return list(options.results)
-    if options.frames or options.maps:
-        raise UsageError("--merge merges regional maps only; leave out --frames and --map")
+    if options.frames or options.maps or options.crs:
+        raise UsageError("--merge merges regional maps in their own frame; leave out --frames, --map and --crs")
     from flow.cli.fleet.catalogue import Catalogue
 
     results: list[Path] = []

@@ -16,7 +16,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Print the file."""
-    from flow.config.loader import pipeline_file
+    from flow.config.loader import pipeline_file, pipeline_text
 
-    say(pipeline_file(options.name, templates=True).read_text(encoding="utf-8").rstrip("\n"))
+    say(pipeline_text(pipeline_file(options.name, templates=True)).rstrip("\n"))
     return COMPLETE

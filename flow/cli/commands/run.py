@@ -65,8 +65,8 @@ def run(options: argparse.Namespace) -> int:
     rrd = None if options.no_rrd else options.rrd or out.parent / f"{out.stem}.rrd"
     outputs = {"result log": out, "recording": rrd, "summary": options.summary}
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
-    if rrd is None and (options.view or options.serve):
-        raise UsageError("--view and --serve need the recording; leave out --no-rrd")
+    if rrd is None and (options.view or options.serve or options.desk):
+        raise UsageError("--view, --serve and --desk need the recording; leave out --no-rrd")
     names = ("workers", "start", "end", "every", "profile", "desk", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
