@@ -28,6 +28,9 @@ def test_only_streams_between_those_given_and_the_wanted_one_are_made(tmp_path):
     found = evaluate(toys, {"sum": Couple(7, 1.0), "height": Number(7, 2.0)}, "raised")
     assert found == {"sum": Couple(7, 1.0), "height": Number(7, 2.0), "raised": Couple(7, 3.0)}
     assert evaluate(toys, GIVEN, "both") == GIVEN
+    own = GIVEN | {"twice": Couple(7, 1.0)}  # not that of its input
+    assert evaluate(toys, own, "twice") == own
+    assert evaluate(toys, own, "sum")["sum"] == Couple(7, 16.0)
 
 
 def test_a_state_continues_only_where_it_is_kept(tmp_path):

@@ -4,13 +4,15 @@ import shlex
 import sqlite3
 import subprocess
 import sys
+from weakref import WeakSet
 
+import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader
 from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import StoragePlugin
 
-from recordings.containers.container import LostMessage, within
+from recordings.containers.container import LostMessage, OpenChunks, within
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
@@ -224,3 +226,17 @@ def test_losses_outside_the_part_that_is_read_are_not_its_losses():
     lost = [LostMessage(None, time, "broken") for time in (30, 10, 20)]
     assert [item.log_time for item in within(lost, 10, 30)] == [10, 20]
     assert [item.log_time for item in within(lost, None, None)] == [10, 20, 30]
+
+
+def test_a_chunk_is_let_go_after_its_last_message():
+    class Chunk:
+        def __len__(self):
+            return 1
+
+    def unpack(number):
+        alive.add(chunk := Chunk())
+        return chunk
+
+    alive, due = WeakSet(), np.array([0, 1, 0, 1, 1])
+    chunks = OpenChunks(due, unpack)
+    assert [bool(chunks.of_next(number)) and len(alive) for number in due] == [1, 2, 1, 1, 0]

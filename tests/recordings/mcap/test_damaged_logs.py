@@ -332,7 +332,7 @@ def test_the_field_log_has_its_tilt_at_ten_hertz():
 
 def test_messages_of_an_undefined_channel_are_reported(tmp_path):
     rows, known = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in range(1, 4)], 1
-    log = write_mcap(tmp_path / "log.mcap", rows, use_chunking=False, use_statistics=False)
+    log = write_mcap(tmp_path / "log.mcap", rows, use_chunking=False)
     content = bytearray(log.read_bytes())
     place = content.index(struct.pack("<BQHIQ", 5, 27, known, 0, 2))
     struct.pack_into("<H", content, place + 9, 999)

@@ -7,6 +7,7 @@ import pytest
 
 from recordings import McapSource
 from recordings.containers.clock import MAX_JITTER_NS
+from recordings.containers.container import RawMessage
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from tests.conftest import Row, mcap_rows, rewrite
@@ -46,6 +47,8 @@ def test_messages_after_a_set_back_clock_are_lost_until_its_old_time(sample, who
     assert {errors for _, errors in images} == {f"{LEFT}: {sentence}"}
     with McapSource().open(path) as log:
         assert log.file.times(log.channels("left")).tolist() == [START + n * PERIOD + 1000 for n in range(FIRST)]
+        kept = log.file.messages(log.channels("left"), allow_repeats=True)
+        assert sum(isinstance(item, RawMessage) for item in kept) == FRAMES
         surveyed = [item for events in log.excerpts(9, {"left"}) for _, stream, item in events if stream == "left"]
     assert {item.stamp for item in surveyed if not isinstance(item, Exception)} == {
         START + number * PERIOD for number in range(FIRST)

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.matching.kernels.texture import BLOCK, gradient, information, match_variance, sky_end, stereo_noise
+from stages.matching.kernels.texture import (
+    BLOCK,
+    contrast,
+    gradient,
+    information,
+    match_variance,
+    sky_end,
+    stereo_noise,
+)
 from stages.matching.kernels.texture import information_reference as plain_information
 
 NOISE = np.full(256, 1.5, np.float32)
@@ -66,3 +74,9 @@ def test_ground_begins_where_texture_or_brightness_ends_the_sky():
         found = sky_end(information(image, gradient(image), NOISE), image, NOISE)
         assert np.mean(abs(found - first) <= within) > 0.9
     assert (sky_end(information(blank, gradient(blank), NOISE), blank, NOISE) == 200).all()
+
+
+def test_the_contrast_of_bands_is_that_of_the_image():
+    image = noisy((31, 40))
+    bands = [contrast(image, first, min(first + 4, 31)) for first in range(0, 31, 4)]
+    assert np.array_equal(np.concatenate(bands), contrast(image, 0, 31))
