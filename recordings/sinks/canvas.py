@@ -49,7 +49,7 @@ VIEWER_COLORMAPS = {  # the viewer's own, by OpenCV's
     cv2.COLORMAP_INFERNO: rr.components.Colormap.Inferno,
 }
 LEGEND_ROW = (0.14, 0.2)  # height of a single row of a legend, and of several, share of the picture's height
-ROW_BESIDE = 0.27  # least height of a row of a legend beside the picture, share of the picture's height
+ROW_BESIDE = 0.2  # least height of a row of a legend beside the picture, share of the picture's height
 MAX_UNIT_CHARS = 3  # of a unit that stands at each value of a scale; a longer one stands at the last
 CLEARED = components_of(rr.Clear(recursive=False))
 (NUMBER,) = (one.descriptor for one in components_of(rr.Scalars(0.0)))
@@ -268,7 +268,7 @@ class Canvas:
     def log_legend(
         self, path: str, shape: tuple[int, ...], entries: Iterable[tuple[str, Rgb]], beside: bool = False
     ) -> None:
-        """Named dots above a picture of (H, W), in a row of at most four or rows of three; or in two columns beside."""
+        """Named dots above a picture of (H, W), in a row of at most four or rows of three; or in a column beside."""
         named = tuple(entries)
         for part, draw in (("", _dots), ("/text", _names)):
             self.log_components(f"{path}{part}", rr.Points2D, recurring=draw(shape, named, beside))
@@ -357,14 +357,14 @@ def _places(
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]], int, float]:
     """The places (x, y) of a legend's dots and of its names, its rows, and the height of one above the picture."""
     height, width = shape
-    rows = -(-count // (2 if beside else LEGEND_COLUMNS[count > LEGEND_COLUMNS[0]]))
+    rows = count if beside else -(-count // LEGEND_COLUMNS[count > LEGEND_COLUMNS[0]])
     columns, row_height = -(-count // rows), LEGEND_ROW[rows > 1] * height
     places = [divmod(number, columns) for number in range(count)]
     if beside:
         pitch = max(1 / rows, ROW_BESIDE) * height
-        dots = [((1.1 + 0.7 * column) * width, height / 2 + (row + (1 - rows) / 2) * pitch) for row, column in places]
+        dots = [(1.1 * width, height / 2 + (row + (1 - rows) / 2) * pitch) for row in range(rows)]
         # A label is centred below its pin.
-        return dots, [(x + 0.33 * width, y - 0.45 * pitch) for x, y in dots], rows, row_height
+        return dots, [(x + 0.41 * width, y - 0.45 * pitch) for x, y in dots], rows, row_height
     dots = [((column + 0.5) * width / columns, (row - rows) * row_height) for row, column in places]
     return dots, dots, rows, row_height
 

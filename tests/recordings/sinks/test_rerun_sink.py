@@ -64,6 +64,15 @@ def test_only_the_logs_clock_and_the_frame_count_are_timelines(rrd):
     assert not names & {"log_time", "log_tick"}
 
 
+def test_the_names_of_origins_stand_in_a_column_beside_their_dots(rrd):
+    paths = "/disparity/source/legend", "/disparity/source/legend/text"
+    dots, pins = (np.array(rows(rrd, path, "Points2D:positions")[0][2]) for path in paths)
+    ((_, _, names),) = rows(rrd, paths[1], "Points2D:labels")
+    assert len(dots) == len(pins) == len(names) > 2
+    assert len(set(dots[:, 0])) == len(set(pins[:, 0])) == 1
+    assert max(map(len, names)) <= len("uniqueness")
+
+
 def test_legends_that_do_not_change_are_stored_once(rrd):
     for legend in ("/disparity/source/legend", "/disparity/pixels/scale/text", "/elevation_map/relief/lines/distances"):
         assert [frame for _, frame, _ in rows(rrd, legend, "Points2D:positions")] == [0], legend
