@@ -16,7 +16,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from flow.contracts import counted
 from flow.parameters import Checked, check_parameters, parameter
+from recordings.containers.time_range import MAX_LATENESS_NS
 from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
 from recordings.ros2.from_msg import frame_of, pose_of, stamp_or, unit_quaternion
@@ -220,12 +222,16 @@ class JoinedAngles:
     def __init__(self, angles: BareAngles) -> None:
         self._angles = angles
         self._pitch: tuple[int, float] | None = None  # the last one, with its stamp
-        self._rolls = deque[tuple[Any, int]](maxlen=MAX_WAITING_ROLLS)  # later than it, with their log times
+        self._rolls = deque[tuple[Any, int]]()  # later than it, with their log times
 
     def add_roll(self, message: Any, log_time: int) -> None:
-        """Keep a roll until the next pitch."""
+        """Keep a roll until the next pitch. Raises LogError for those that wait in vain."""
         self._angles.roll(message)  # raises LogError
         self._rolls.append((message, log_time))
+        count, since = len(self._rolls), self._rolls[0][1]
+        if log_time - since > MAX_LATENESS_NS or count > MAX_WAITING_ROLLS:
+            self._rolls.clear()
+            raise LogError(f"no pitch follows the last {counted(count, 'roll')}, since {since} ns")
 
     def add_pitch(self, message: Any, log_time: int) -> Tilt | None:
         """The tilt at the last roll between the pitch before and this one; None if there is none."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from recordings import McapSource
+from recordings.errors import LogError
 from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
@@ -77,6 +78,17 @@ def test_a_roll_before_both_pitches_or_at_the_time_of_one_is_not_extrapolated():
     joined.add_pitch(angle, START + 2)
     joined.add_roll(angle, START + 1)
     assert joined.add_pitch(angle, START + 3) is None
+
+
+def test_rolls_that_no_pitch_follows_for_3_s_are_lost_together():
+    joined, angle = JoinedAngles(BareAngles(PITCH, ROLL, "axis")), make("std_msgs/msg/Float64", data=3.0)
+    joined.add_pitch(angle, START)
+    for number in range(4):
+        joined.add_roll(angle, START + number * 1_000_000_000)
+    with pytest.raises(LogError, match=f"no pitch follows the last 5 rolls, since {START} ns"):
+        joined.add_roll(angle, START + 3_500_000_000)
+    joined.add_roll(angle, START + 4_000_000_000)
+    assert joined.add_pitch(angle, START + 5_000_000_000).stamp == START + 4_000_000_000
 
 
 def test_a_bad_roll_is_lost_alone(tmp_path):
