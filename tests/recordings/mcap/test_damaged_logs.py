@@ -24,6 +24,7 @@ from recordings import McapSource
 from recordings.containers.container import LostMessage
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
+from recordings.containers.timeline import MAX_LOG_TIME
 from recordings.errors import LogError
 from recordings.inventory.text import format_description
 from recordings.mcap.chunk import unpack_chunk
@@ -231,7 +232,8 @@ def test_losses_are_placed_after_the_last_message_before_them():
     for time in (5, 9, 7):
         index.add(0, 0, 0, array("H", [1, 1]), array("Q", [time, 1 << 63]))
         index.note_damage("gone")
-    assert [lost.log_time for lost in index.lost] == [5, 9, 9]
+    index.note_damage("a chunk of damaged time is gone", 1 << 63)
+    assert [lost.log_time for lost in index.lost] == [5, 9, 9, MAX_LOG_TIME]
 
 
 def test_statistics_without_channel_counts_do_not_mean_an_empty_log(sample, whole, tmp_path, monkeypatch):
@@ -328,6 +330,31 @@ def test_the_field_log_has_its_tilt_at_ten_hertz():
     tilts = [item for _, stream, item in items_of(path) if stream == "inclinometer"]
     assert len(tilts) == 161
     assert all(abs(np.linalg.norm(tilt.up) - 1) < 1e-9 for tilt in tilts)
+
+
+@pytest.mark.parametrize(("options", "start", "opcode", "found"), [
+    ({"use_chunking": False}, struct.pack("<BQHIQ", Opcode.MESSAGE, 27, 1, 0, 1002), Opcode.HEADER, {1001, 1003, 1004}),
+    ({"chunk_size": 1}, struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 22, 1, 16), Opcode.DATA_END, set(TIMES)),
+])  # fmt: skip
+def test_a_record_of_a_wrong_opcode_is_lost_alone(tmp_path, options, start, opcode, found):
+    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, b"\0\1\0\0\0") for time in TIMES]
+    log = write_mcap(tmp_path / "log.mcap", rows, use_statistics=False, **options)
+    content = bytearray(log.read_bytes())
+    place = content.index(start)
+    content[place] = opcode
+    log.write_bytes(content)
+    with McapFile(log) as file:
+        items = list(file.messages(set(file.channels)))
+    assert {item.log_time for item in items if not isinstance(item, LostMessage)} == found
+    (lost,) = (item.reason for item in items if isinstance(item, LostMessage))
+    assert lost.startswith(f"the record at byte {place} is broken (")
+
+
+def test_a_schema_whose_text_is_cut_is_damage():
+    text = b"int8 a"
+    content = struct.pack("<HI3sI7sI", 1, 3, b"a/A", 7, b"ros2msg", len(text) + 1) + text
+    with pytest.raises(ValueError, match="cut short"):
+        Index().define(Opcode.SCHEMA, content)
 
 
 def test_messages_of_an_undefined_channel_are_reported(tmp_path):

@@ -277,6 +277,12 @@ def test_chunks_that_overlap_are_unpacked_again_beyond_a_limit(sample, whole, tm
     assert counts[1] > counts[0]
 
 
+def test_short_messages_keep_no_chunk_in_memory(sample):
+    with McapFile(sample) as file:
+        assert len(file.index.chunks) == 1
+        assert all(len(item.data.obj) == len(item.data) for item in file.messages(set(file.channels)))
+
+
 def test_a_chunk_that_was_just_read_is_not_unpacked_again(sample, unpacked):
     with McapFile(sample) as file:
         once, again = ([[*file.messages({number})] for number in file.channels] for _ in range(2))

@@ -61,11 +61,13 @@ def test_a_window_reaches_as_far_as_asked_to_either_side_of_the_prior(height, co
     rng = np.random.default_rng(seed)
     prior = rng.uniform(-60, 320, (height, columns)).astype(np.float32)
     prior[rng.random(prior.shape) < 0.2] = np.nan
+    prior[rng.random(prior.shape) < 0.05] = 1e30
     first, width = windows_around(prior, reach, least)
     x = np.arange(columns)
     assert (first <= x).all()  # it begins in the image
     assert (first >= x - columns + 1).all()
     assert (first >= np.minimum(least, x)).all()
+    assert (first == x)[prior > 1e6].all()
     free = np.isfinite(prior) & (first < x) & (first > np.maximum(least, x - columns + 1))
     assert (first + WINDOW_EDGE <= prior - reach)[free].all()
     assert (prior + reach <= first + width.lanes - 1 - WINDOW_EDGE)[free].all()

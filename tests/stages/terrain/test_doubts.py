@@ -1,5 +1,7 @@
 """Binarise doubts ground beside what is out of view: obstacles that the edge of view cuts, drops and holes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_dilation
@@ -35,7 +37,9 @@ def test_a_wall_that_the_edge_of_view_cuts_far_away_names_its_doubt():
     rule, (row, col) = Binarise(), (30, 80)
     assert rule(terrain).reason[row, col] == CellReason.UNSURE
     assert doubts_at(rule, terrain, row, col) == ["on an obstacle that the edge of view cuts (min_rise)"]
-    assert "min_rise" in [turn.parameter for turn in turns_at(rule, terrain, row, col)]
+    (turn,) = (turn for turn in turns_at(rule, terrain, row, col) if turn.parameter == "min_rise")
+    short, enough = (replace(rule, min_rise=value)(terrain) for value in (turn.needed / 1.01, turn.needed))
+    assert (short.cells[row, col], enough.cells[row, col]) == (Cell.UNKNOWN, turn.verdict) == (-1, 0)
 
 
 @pytest.mark.parametrize(
