@@ -17,7 +17,8 @@ HEIGHT, WIDTH, FIRST, END = 24, 160, 70, 100  # columns of the flank of a boulde
 def test_bridges_equal_their_reference_bit_by_bit(height, width, seed):
     rng = np.random.default_rng(seed)
     disparity = np.repeat(rng.uniform(0, 30, (height, width // 6 + 1)), 6, axis=1)[:, :width].astype(np.float32)
-    for y, x, length in zip(rng.integers(0, height, 9), rng.integers(0, width, 9), rng.integers(1, 20, 9), strict=True):
+    lengths = rng.integers(1, rng.choice([6, 20]), 9)
+    for y, x, length in zip(rng.integers(0, height, 9), rng.integers(0, width, 9), lengths, strict=True):
         disparity[y, x : x + length] = np.nan
     left, right = rng.integers(0, rng.choice([8, 60, 256]), (2, height, width)).astype(np.uint8)
     found = fill_holes(disparity, left, extent(disparity), 64, 8)
