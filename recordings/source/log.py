@@ -31,7 +31,7 @@ from recordings.source.stream_readers import StreamReaders, by_channel
 from recordings.source.tilt_reading import Sampled, estimated_tilts
 from recordings.source.topics import TopicReader, attempt, with_lookahead
 from recordings.video.formats import VIDEO, VIDEO_NOTE
-from stages.data import CameraImage, Mount
+from stages.data import CameraImage, Mount, Tilt
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
 MAX_CALIBRATION_LAG_NS = 100_000_000  # a calibration may be logged this much later than its image
@@ -132,10 +132,11 @@ class McapLog:
     def _estimated(self, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
         """The estimates of up in a part of the log, also from samples before and after."""
         readers = by_channel(self._readers.of_samples())
-        source, wide = self.source, part.widened(LOOKAHEAD_NS)
+        source, offset = self.source, self.time_offset("inclinometer")
+        wide = part.widened(LOOKAHEAD_NS + min(abs(offset), MAX_LATENESS_NS))
         self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
         for log_time, item in estimated_tilts(self._samples(readers, wide), self._estimator):
-            if part.has(0, log_time):
+            if part.has(item.stamp + offset if isinstance(item, Tilt) else 0, log_time):
                 yield log_time, "inclinometer", item
 
     def _samples(self, readers: dict[int, list[TopicReader]], part: TimeRange) -> Iterator[Sampled]:

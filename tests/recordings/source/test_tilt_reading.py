@@ -18,6 +18,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
+from recordings.source.settings import TimeOffsets
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite, slow
 from tests.recordings.inertial.drive import Drive, drive
@@ -99,6 +100,18 @@ def test_a_part_of_a_log_has_tilts_as_good_as_the_whole(tmp_path):
     driven = drive(seconds=40)
     path = written(tmp_path / "log.mcap", driven)
     tilts, _, _ = read(path, start=16, end=17)
+    times = (np.array([tilt.stamp for tilt in tilts]) - driven.stamps[0]) / 1e9
+    assert (times[0], times[-1]) == (pytest.approx(15, abs=0.02), pytest.approx(18, abs=0.02))
+    assert driven.errors(tilts).max() < 0.6
+
+
+@pytest.mark.parametrize("logged_late", [0, 2_000_000_000])
+def test_a_part_of_a_log_has_the_estimates_around_it_by_corrected_stamps(tmp_path, logged_late):
+    driven, late = drive(seconds=40), 2_000_000_000
+    path = written(tmp_path / "log.mcap", driven, lambda number, stamp, *values: kalibr(number, stamp + late, *values))
+    path = rewrite(path, tmp_path / "late.mcap", time=lambda topic, time: time + logged_late * (topic == IMU))
+    source = McapSource(time_offset=TimeOffsets(inclinometer=-late))
+    tilts, _, _ = read(path, source, start=16, end=17)
     times = (np.array([tilt.stamp for tilt in tilts]) - driven.stamps[0]) / 1e9
     assert (times[0], times[-1]) == (pytest.approx(15, abs=0.02), pytest.approx(18, abs=0.02))
     assert driven.errors(tilts).max() < 0.6
