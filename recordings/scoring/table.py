@@ -96,11 +96,15 @@ def _frame_lines(found: Score) -> list[str]:
     lines = [f"frames       {found.compared} of {found.frames} have results"]
     if found.beyond:
         lines.append(f"not counted  {counted(found.beyond, 'frame')} outside the part of the log that was run")
+    notes = []
     for topic, stamps in found.missing.items():
-        lines.append(f"missing      {topic}: {len(stamps)} of {counted(found.frames, 'frame')}, scored as all unknown")
+        name, everywhere = topic.removeprefix("/nav/"), len(stamps) == found.frames
+        remedy = f"; name the stream '{name}', and let McapSink write it" if everywhere else ""
+        of_all = f"{len(stamps)} of {counted(found.frames, 'frame')}"
+        notes.append(f"missing      {topic}: {of_all}, scored as all unknown{remedy}")
     for topic, count in found.unmatched.items():
-        lines.append(f"unmatched    {topic}: {counted(count, 'message')} at stamps without truth, not scored")
-    notes = [
+        notes.append(f"unmatched    {topic}: {counted(count, 'message')} at stamps without truth, not scored")
+    notes += [
         f"not scored   {topic}: {counted(count, 'frame')}: {why}"
         for topic, reasons in found.unscored.items()
         for why, count in reasons.items()

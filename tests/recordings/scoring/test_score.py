@@ -267,6 +267,13 @@ def test_a_missing_frame_scores_as_one_of_unknown_cells(tmp_path, truth, frames)
     assert honest.missing == {}
 
 
+def test_a_result_that_no_frame_has_is_missing_with_the_remedy(tmp_path, truth, frames):
+    text = format_score(scored(tmp_path, truth, frames, only=scoring.RESULTS[1:]))
+    assert "/nav/disparity: 2 of 2 frames, scored as all unknown; name the stream 'disparity', and" in text
+    partly = Run(skipped=(1,)).write(tmp_path / "partly.mcap", frames)
+    assert "1 of 2 frames, scored as all unknown\n" in format_score(scoring.score(partly, truth))
+
+
 def test_an_unscored_tilt_has_a_reason(tmp_path, truth, frames):
     found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
     assert found.tilt is None
