@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from recordings.containers import container
 from recordings.errors import LogError
 from recordings.mcap import chunk
 from recordings.mcap.file import McapFile
-from tests.conftest import Extra, rewrite
+from tests.conftest import Extra, rewrite, write_mcap
 from tests.fuzz.isolation import MAX_MEGABYTES, isolated
 from tests.fuzz.targets import read_events, read_info, read_log
 from tests.recordings import sample_log
@@ -288,6 +289,28 @@ def test_a_chunk_that_was_just_read_is_not_unpacked_again(sample, unpacked):
         once, again = ([[*file.messages({number})] for number in file.channels] for _ in range(2))
         assert once == again
         assert len(unpacked) == len(file.index.chunks)
+
+
+def test_large_chunks_are_let_go_one_after_the_other_and_on_close(tmp_path, monkeypatch):
+    rows = [("/a", "cdr", ("a/A", "ros2msg", b"int8 a"), time, NOTHING) for time in (1, 2, 3)]
+    log = write_mcap(tmp_path / "log.mcap", rows, chunk_size=1)
+    alive, before = WeakSet(), []
+
+    class Watched(chunk.ChunkTable):
+        def __init__(self, *parts):
+            super().__init__(*parts)
+            before.append(len(alive))
+            alive.add(self)
+
+    monkeypatch.setattr("recordings.mcap.file.ChunkTable", Watched)
+    for largest in (0, 1 << 20):  # bytes of a chunk that may be kept
+        monkeypatch.setattr("recordings.mcap.file._RECENT_BYTES", largest)
+        with McapFile(log) as file:
+            reader = file.messages(set(file.channels))
+            assert [next(reader).log_time, next(reader).log_time] == [1, 2]
+        del reader  # in the middle
+        assert not alive
+    assert before == [0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("use_chunking", [True, False])
