@@ -304,6 +304,18 @@ def test_a_sink_without_an_output_is_refused(traverse, tmp_path, refused, sinks,
     assert not (tmp_path / "out.mcap").exists()
 
 
+def test_a_run_whose_streams_no_result_log_contains_is_refused(traverse, tmp_path, refused):
+    (tmp_path / "own.yaml").write_text("""
+source: {use: recordings.McapSource}
+streams:
+  stereo: {use: flow.align.pair, left: left, right: right}
+  own:    {use: stages.Match, frame: stereo, disparities: 64}
+sinks: [{use: recordings.McapSink}]
+""")
+    why = refused("run", traverse, "-p", tmp_path / "own.yaml", "-o", tmp_path / "out.mcap")
+    assert "recordings.McapSink writes none of the streams stereo, own; name some in its 'also', or leave it out" in why
+
+
 def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
     log = os.fsencode(tmp_path / "Fahrt-") + b"\xfcd.mcap"
     os.link(traverse, log)

@@ -96,6 +96,8 @@ def _unknown(change: Change, streams: Mapping[str, Value], parts: Iterable[str],
     """The sentence about a change whose target is neither an entry nor a setting."""
     target, keys, entries = change.target, change.keys, [*streams, *parts]
     of_class = [name for name, item in streams.items() if _class_name(item).lower() == target.lower()]
+    if keys and target in ("settings", "streams", "sinks"):
+        return f"leave out '{target}.'"
     if keys and of_class:
         return f"write the stream in place of its class '{target}': {' or '.join(of_class)}"
     if keys:

@@ -41,6 +41,9 @@ class _Outputs:
         sinks = {use: replace(sink) for use, sink in graph.sinks if use in paths}
         kinds = graph.frame_streams.items()
         wanted = {use: [name for name, kind in kinds if sink.wants(name, kind)] for use, sink in sinks.items()}
+        for use in (use for use, streams in wanted.items() if not streams):
+            naming = "".join(f"name some in its '{key}', or " for key in getattr(sinks[use], "names_streams", ())[-1:])
+            raise UsageError(f"{use} writes none of the streams {', '.join(dict(kinds))}; {naming}leave it out")
         return cls({use: (sink, wanted[use]) for use, sink in sinks.items()}, paths)
 
     def open(self, kinds: Mapping[str, type], about: Mapping[str, str]) -> bool:

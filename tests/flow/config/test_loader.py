@@ -211,6 +211,7 @@ def test_a_setting_is_filled_in_wherever_it_is_named(tmp_path):
     (SETTINGS, ["disparities=1"], r"--set disparities=1: the pipeline has no setting 'disparities'; it has .*stretch"),
     (SETTINGS, ["strech.a=1 m"], r"--set strech.a=1 m: there is no stream 'strech'; did you mean 'stretch'"),
     (SETTINGS, ["Scale.factor=1 m"], r"--set Scale.factor=1 m: write the stream in place of its class 'Scale': twice"),
+    (SETTINGS, ["streams.twice.factor=1 m"], r"--set streams.twice.factor=1 m: leave out 'streams.'"),
     (SETTINGS, ["twice=1 m"], r"--set twice=1 m: name the parameter of 'twice', as in twice.parameter=value"),
     (SETTINGS, ["twice.optional=maybe"], r"--set twice.optional=maybe: 'optional' must be true or false, not maybe"),
     (SETTINGS.replace("settings", "setings"), [], r"toy.yaml:1: a pipeline has no 'setings'; did you mean 'settings'"),
