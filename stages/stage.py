@@ -6,7 +6,8 @@ import inspect
 import pickle
 import re
 from dataclasses import Field, dataclass
-from typing import Any, Self
+from functools import cache
+from typing import Any, Self, get_args, get_type_hints
 
 from flow.contracts import StageError
 from flow.parameters import Checked
@@ -73,16 +74,22 @@ def check_cells(what: str, width: float, resolution: float, times: int = 1) -> N
         )
 
 
-def check_type(stage: Stage, port: str, item: Any, kind: type) -> None:
-    """Raise StageError for an input of another type, such as a bare array."""
-    if not isinstance(item, kind):
-        name = type(stage).__name__
-        raise StageError(f"{name}: the {port} must be a stages.{kind.__name__}, not a {type(item).__name__}")
+_types = cache(get_type_hints)  # of the inputs of a stage
+
+
+def check_types(stage: Stage, **inputs: Any) -> None:
+    """Raise StageError for an input that is not of the type that `__call__` names, such as a bare array."""
+    kinds = _types(type(stage).__call__)
+    for port, item in inputs.items():
+        if not isinstance(item, kinds[port]):
+            wanted = next(iter(get_args(kinds[port])), kinds[port]).__name__
+            name = type(stage).__name__
+            raise StageError(f"{name}: the {port} must be a stages.{wanted}, not a {type(item).__name__}")
 
 
 def check_rectified(stage: Stage, frame: StereoFrame) -> None:
     """Raise StageError for a frame that is not rectified, or is none, as a single image."""
-    check_type(stage, "frame", frame, StereoFrame)
+    check_types(stage, frame=frame)
     if frame.camera.raw is not None:
         name = type(stage).__name__
         raise StageError(f"{name}: the frame is not rectified; put stages.Rectify before stages.{name}")
@@ -90,7 +97,7 @@ def check_rectified(stage: Stage, frame: StereoFrame) -> None:
 
 def check_level(stage: Stage, cloud: PointCloud) -> None:
     """Raise StageError for a cloud that is not in frame `level`."""
-    check_type(stage, "cloud", cloud, PointCloud)
+    check_types(stage, cloud=cloud)
     if cloud.frame_id != LEVEL_FRAME:
         name = type(stage).__name__
         raise StageError(
@@ -101,7 +108,7 @@ def check_level(stage: Stage, cloud: PointCloud) -> None:
 def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None:
     """Raise StageError for a frame that is not rectified, or a disparity of another size."""
     check_rectified(stage, frame)
-    check_type(stage, "disparity", disparity, Disparity)
+    check_types(stage, disparity=disparity)
     if disparity.pixels.shape != frame.left.shape[:2]:
         raise StageError(
             f"{type(stage).__name__}: the disparity is {disparity.pixels.shape}, the left image "

@@ -19,7 +19,7 @@ from stages.cloud.kernels.outliers import MAX_SLOPE_RATIO, median_slope, support
 from stages.cloud.kernels.patches import connected_patches
 from stages.data import Array, PointCloud
 from stages.data.arrays import rows_of
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_types, parameter
 
 MIN_PATCH_SHARE = 5e-4  # organised: smaller isolated patches, as a share of the cloud, are dropped
 KNN_NEIGHBOURS = 20
@@ -51,6 +51,7 @@ class Clean(Stage):
 
     def __call__(self, cloud: PointCloud) -> PointCloud:
         """The near points of `cloud` that are no outliers, in their order; there may be none."""
+        check_types(self, cloud=cloud)
         if cloud.sensor is not None:
             raise StageError(f"Clean: the cloud is in frame '{cloud.frame_id}', not its camera's; Clean precedes Level")
         keep = self._organised(cloud) if self.method == "organised" else self._knn(cloud)

@@ -14,7 +14,7 @@ import numpy as np
 from flow.contracts import StageError
 from stages.cloud.kernels.rigid import transform_points
 from stages.data import LEVEL_FRAME, Array, Mount, PointCloud, Tilt, Transform
-from stages.stage import Stage, check_type, parameter
+from stages.stage import Stage, check_types, parameter
 
 _MIN_HORIZONTAL = 0.1  # of a unit heading, 6 degrees off the vertical; below it tilt noise decides the direction
 
@@ -46,8 +46,7 @@ class Level(Stage):
 
         Without `mount` the tilt must be in the cloud's own frame, because the inclinometer's mounting is never guessed.
         """
-        check_type(self, "cloud", cloud, PointCloud)
-        check_type(self, "tilt", tilt, Tilt)
+        check_types(self, cloud=cloud, tilt=tilt, mount=mount)
         if cloud.sensor is not None:
             raise StageError(f"Level: the cloud is in frame '{cloud.frame_id}', not its camera's; level it only once")
         if not cloud.measured.any():

@@ -43,8 +43,8 @@ class Reproject(Stage):
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> PointCloud:
         """The cloud of `disparity`, with the colours of the left image in 8 bit; it may be empty."""
-        camera = disparity.camera or frame.camera
         check_joined(self, frame, disparity)
+        camera = disparity.camera or frame.camera
         colors = eight_bit(frame.left)[0]
         points, rgb, sigma, pixel = triangulate(
             disparity, colors, camera, self.max_depth, self.include_filled, self.max_spacing

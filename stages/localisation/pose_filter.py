@@ -17,7 +17,7 @@ from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import translated_covariance
 from stages.data.rotations import canonical, quaternion_of, turn_by
 from stages.localisation.pose_check import PoseCheck
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_types, parameter
 
 VISUAL_FRAME = "visual_odom"  # "visual_odom/2" after tracking was lost once
 SCALE_ERROR = 0.005  # relative error common to all steps' lengths; half of it sideways
@@ -89,6 +89,7 @@ class PoseFilter(Stage):
         Its frame is `visual_odom`: z up, with the origin and heading of the first frame. After tracking is lost a new
         frame begins, "visual_odom/2" and so on. Raises StageError if the images do not determine the motion.
         """
+        check_types(self, motion=motion, tilt=tilt, mount=mount, logged=logged)
         state.segment = motion.segment
         if logged is not None:
             state.check.add(motion, logged, mount)

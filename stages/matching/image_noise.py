@@ -14,7 +14,7 @@ import numpy as np
 
 from stages.data import Array, ImageNoise, StereoFrame
 from stages.matching.intensity import gray_pair
-from stages.stage import Stage
+from stages.stage import Stage, check_types
 
 # Along rows and columns. The lens blurs what it shows of texture; white noise of variance 1 keeps that variance.
 FOURTH_DIFFERENCE = np.array([1, -4, 6, -4, 1], np.float32) / np.sqrt(70, dtype=np.float32)
@@ -50,6 +50,7 @@ class MeasureNoise(Stage):
 
     def __call__(self, frame: StereoFrame) -> ImageNoise:
         """The noise of `frame.left`."""
+        check_types(self, frame=frame)
         return ImageNoise(frame.stamp, frame.once(frame_noise))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from flow.contracts import StageError
 from stages.data import Disparity
 from stages.matching.kernels.lr_check import drop_inconsistent
-from stages.stage import Stage, check_same_time, parameter
+from stages.stage import Stage, check_same_time, check_types, parameter
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class LeftRightCheck(Stage):
 
     def __call__(self, disparity: Disparity, backward: Disparity) -> Disparity:
         """The left disparity without the pixels that `backward` contradicts; their source is LEFT_RIGHT."""
+        check_types(self, disparity=disparity, backward=backward)
         if disparity.pixels.shape != backward.pixels.shape:
             raise StageError(
                 f"LeftRightCheck: the disparities have shapes {disparity.pixels.shape} and {backward.pixels.shape}; "

@@ -27,7 +27,7 @@ from stages.matching.kernels.semiglobal import Matches, match
 from stages.matching.kernels.sgm_local import SearchWindows, windows_around
 from stages.matching.kernels.sgm_params import SgmParams
 from stages.matching.kernels.texture import information, match_variance, noise_ratio, slopes
-from stages.stage import Stage, check_rectified, check_type, parameter
+from stages.stage import Stage, check_rectified, check_types, parameter
 
 F32 = np.float32
 MIN_SIDE = 16  # px, of an image
@@ -190,7 +190,7 @@ class Match(Stage):
         self.check_inputs({"frame"} if prior is None else {"frame", "prior"})
         if prior is None:
             return
-        check_type(self, "prior", prior, Disparity)
+        check_types(self, prior=prior)
         if prior.pixels.shape != (height, width):
             raise StageError(
                 f"Match: the prior has shape {prior.pixels.shape}, the images {(height, width)}; "

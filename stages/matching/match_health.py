@@ -12,7 +12,7 @@ import numpy as np
 
 from flow.contracts import Finding, Severity
 from stages.data import Disparity, MatchHealth, PixelOrigin
-from stages.stage import Stage
+from stages.stage import Stage, check_types
 
 NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
 MIN_CONFIDENCE = 0.35  # of a match; those that OpenCV finds of ground closer than the search range have less
@@ -37,6 +37,7 @@ class CheckMatches(Stage):
 
     def __call__(self, disparity: Disparity, *, state: list[float]) -> MatchHealth:
         """The matched share of the right half of the image; the right camera does not see all of the left half."""
+        check_types(self, disparity=disparity)
         height, width = disparity.pixels.shape
         rows, half = max(1, round(NEAR_ROWS * height)), np.s_[:, width // 2 :]
         source, confidence = disparity.source[half], disparity.confidence[half]

@@ -14,7 +14,7 @@ from flow.contracts import StageError
 from stages.data import Disparity, StereoFrame
 from stages.matching.kernels.resample import doubled, halved
 from stages.matching.match import MIN_SIDE
-from stages.stage import Stage, check_rectified, check_same_time, parameter
+from stages.stage import Stage, check_rectified, check_same_time, check_types, parameter
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,7 @@ class Upsample(Stage):
 
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> Disparity:
         """The disparity of `frame`, from that of `Halve()(frame)`."""
+        check_types(self, frame=frame, disparity=disparity)
         height, width = frame.left.shape[:2]
         small = disparity.pixels.shape
         if small != ((height + 1) // 2, (width + 1) // 2):

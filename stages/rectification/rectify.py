@@ -25,7 +25,7 @@ from flow.contracts import Finding, Severity, StageError, counted
 from stages.data import Array, CameraModel, StereoCamera, StereoFrame
 from stages.matching.intensity import eight_bit, gray
 from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_down, offset_field
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_types, parameter
 
 MAX_ROW_OFFSET = 64.0  # px
 UNUSUAL_ROW_OFFSET = 8.0  # px, more than a calibration leaves
@@ -83,6 +83,7 @@ class Rectify(Stage):
 
     def __call__(self, frame: StereoFrame) -> StereoFrame:
         """The rectified frame; its `camera` has no `raw`."""
+        check_types(self, frame=frame)
         if self._terms is not None and not self._may_move(frame.camera):
             return _rectified(frame, self._terms, self.columns or 0)
         plain = _rectified(frame)

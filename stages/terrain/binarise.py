@@ -15,7 +15,7 @@ import numpy as np
 from flow.contracts import StageError
 from stages.data import Array, Cell, CellReason, ElevationMap, NavigationMap, Rover
 from stages.data.arrays import Span, spanned
-from stages.stage import Stage, check_type, parameter
+from stages.stage import Stage, check_types, parameter
 
 LAYERS = ("ground", "step", "slope", "steepness", "roughness", "support")  # of TerrainFeatures
 STATE_OF = np.full(len(CellReason), Cell.HAZARD, np.int8)  # by reason
@@ -76,7 +76,7 @@ class Binarise(Stage):
 
     def __call__(self, elevation: ElevationMap) -> NavigationMap:
         """The navigation map on the grid of `elevation`."""
-        check_type(self, "elevation", elevation, ElevationMap)
+        check_types(self, elevation=elevation)
         window = _shown(elevation)
         reason = np.full(elevation.shape, CellReason.UNOBSERVED, np.uint8)
         within = {name: layer[window] for name, layer in elevation.layers.items()}

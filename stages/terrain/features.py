@@ -15,7 +15,7 @@ import numpy as np
 
 from stages.data import Array, ElevationMap, Rover
 from stages.data.arrays import Span, spanned
-from stages.stage import Stage, check_type, parameter
+from stages.stage import Stage, check_types, parameter
 from stages.terrain.kernels.cell_steps import cell_steps
 from stages.terrain.kernels.local_minimum import local_minimum
 from stages.terrain.kernels.nearest_known import nearest_known
@@ -70,7 +70,7 @@ class TerrainFeatures(Stage):
 
     def __call__(self, elevation: ElevationMap) -> ElevationMap:
         """The map with the layers added."""
-        check_type(self, "elevation", elevation, ElevationMap)
+        check_types(self, elevation=elevation)
         around, inside = self._windows(elevation)
         within = replace(elevation, layers={name: layer[around] for name, layer in elevation.layers.items()})
         layers = dict(elevation.layers)

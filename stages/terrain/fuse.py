@@ -16,7 +16,7 @@ import numpy as np
 from flow.contracts import Finding, Severity, StageError, counted
 from stages.data import Array, ElevationMap, Mount, PointCloud, Pose, Region, Transform
 from stages.data.tiles import put, taken
-from stages.stage import Stage, check_cells, check_level, parameter
+from stages.stage import Stage, check_cells, check_level, check_types, parameter
 from stages.terrain.fused_map import FusedMap, Observation, cells_of, merged, variance_of, with_ceiling
 from stages.terrain.height_alignment import fit_plane, plane_height
 from stages.terrain.kernels.cell_gradient import gradient_and_curvature
@@ -94,6 +94,7 @@ class FuseRegion(Stage):
 
     def __call__(self, cloud: PointCloud, pose: Pose, mount: Mount | None = None, *, state: FusedMap) -> Region:
         """The region in the pose's frame, with a cloud in frame `level` merged in."""
+        check_types(self, pose=pose, mount=mount)
         self._check(cloud, state)
         level, up = register(self, cloud, pose, mount)
         if state.logged is not None and pose.frame_id == state.frame_id:

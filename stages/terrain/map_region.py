@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.data import RIM_WIDTH, ElevationMap, Region
-from stages.stage import Stage, check_cells, parameter
+from stages.stage import Stage, check_cells, check_types, parameter
 from stages.terrain.fused_map import layers_of
 
 AHEAD = (4.0, 0.0, 0.0)  # m in frame `level`; the place that moves when the rover turns
@@ -65,6 +65,7 @@ class MapRegion(Stage):
 
     def __call__(self, region: Region, *, state: MapProgress) -> ElevationMap | None:
         """The map of a region in the pose's frame, or None."""
+        check_types(self, region=region)
         check_cells("MapRegion.window", self.window, region.resolution)
         held, changed = state.held, state.changed
         if held is not None and changed is not None and _way(held, region) > MAX_GAP:

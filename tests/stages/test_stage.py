@@ -40,6 +40,11 @@ def disparity(height=60, width=80, stamp=7):
 
 OF_FRAME_AND_DISPARITY = stages.Refine(), stages.RefinePaper(), stages.Reproject()
 JOIN = "join the disparity with the rectified frame"
+ANYTHING = (
+    (stages.Rectify(), 1), (stages.Clean(), 1), (stages.MeasureNoise(), 1), (Running(stages.MapRegion()), 1),
+    (Running(stages.CheckMatches()), 1), (stages.LeftRightCheck(), 2), (stages.Upsample(), 2),
+    (Running(stages.CheckTilt()), 3), (Running(stages.PoseFilter()), 3),
+)  # fmt: skip
 NO_FRAME = "the frame must be a stages.StereoFrame, not a"
 TIMES = "frame of 7 ns, disparity of 8 ns: join data"
 
@@ -60,6 +65,8 @@ TIMES = "frame of 7 ns, disparity of 8 ns: join data"
     (stages.Level(), (disparity(), None), "Level: the cloud must be a stages"),
     *((stage, (IMAGE,), rf"{type(stage).__name__}: the elevation must be a stages\.ElevationMap, not a ndarray")
       for stage in (stages.TerrainFeatures(), stages.Binarise())),
+    *((stage, (IMAGE,) * inputs, r"\w+: the \w+ must be a stages\.\w+, not a ndarray")
+      for stage, inputs in ANYTHING),
     *((stage, (FRAME, disparity(stamp=8)), f"{type(stage).__name__}: {TIMES}") for stage in OF_FRAME_AND_DISPARITY[:2]),
     (Running(stages.VisualOdometry()), (FRAME, disparity(30)), JOIN),
     (stages.Upsample(), (FRAME, disparity(40, 66)), r"Upsample: .*\(40, 66\)"),

@@ -17,7 +17,7 @@ from stages.data.rotations import angle_of
 from stages.localisation.tilt.causes import Evidence
 from stages.localisation.tilt.diagnosis import INCONSISTENT, OFF_GROUND, Diagnosis, diagnose, off_level
 from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
-from stages.stage import Stage, parameter
+from stages.stage import Stage, check_types, parameter
 
 MIN_STEP = 0.05  # m, or
 MIN_TURN = float(np.deg2rad(0.3))  # rad, from the last frame kept
@@ -95,6 +95,7 @@ class CheckTilt(Stage):
         self, motion: CameraMotion, tilt: Tilt, mount: Mount, cloud: PointCloud | None = None, *, state: TiltMemory
     ) -> TiltHealth:
         """The tilt's health so far; `cloud`, of the same camera, shows the ground."""
+        check_types(self, motion=motion, tilt=tilt, mount=mount, cloud=cloud)
         ground = _ground_normal(cloud) if cloud is not None else np.full(3, np.nan)
         up = mount.camera_from_inclinometer @ tilt.up
         turn = np.nan
