@@ -17,8 +17,7 @@ HEIGHT, WIDTH, FIRST, END = 24, 160, 70, 100  # columns of the flank of a boulde
 def test_bridges_equal_their_reference_bit_by_bit(height, width, seed):
     rng = np.random.default_rng(seed)
     disparity = np.repeat(rng.uniform(0, 30, (height, width // 6 + 1)), 6, axis=1)[:, :width].astype(np.float32)
-    lengths = rng.integers(1, rng.choice([6, 20]), 9)
-    for y, x, length in zip(rng.integers(0, height, 9), rng.integers(0, width, 9), lengths, strict=True):
+    for y, x, length in zip(rng.integers(0, height, 9), rng.integers(0, width, 9), rng.integers(1, 20, 9), strict=True):
         disparity[y, x : x + length] = np.nan
     left, right = rng.integers(0, rng.choice([8, 60, 256]), (2, height, width)).astype(np.uint8)
     found = fill_holes(disparity, left, extent(disparity), 64, 8)
@@ -30,16 +29,20 @@ def test_bridges_equal_their_reference_bit_by_bit(height, width, seed):
 
 def scene(flank):
     """Disparities of ground and boulder with a hole between, and images of a scene with disparities `flank` there."""
-    rng = np.random.default_rng(3)
     disparity = np.full((HEIGHT, WIDTH), GROUND, np.float32)
     disparity[:, END:] = TOP
     true = disparity.copy()
     true[:, FIRST:END] = flank
     disparity[:, FIRST:END] = np.nan
-    right = rng.integers(60, 190, (HEIGHT, WIDTH)).astype(np.uint8)
+    return disparity, *images(true)
+
+
+def images(true):
+    """The two images of a scene of random texture with these disparities."""
+    right = np.random.default_rng(3).integers(60, 190, (HEIGHT, WIDTH)).astype(np.uint8)
     places = np.arange(WIDTH) - true
     left = np.stack([np.interp(place, np.arange(WIDTH), row) for place, row in zip(places, right, strict=True)])
-    return disparity, left.astype(np.uint8), right
+    return left.astype(np.uint8), right
 
 
 def bridged(disparity, left, right):
@@ -58,6 +61,18 @@ def test_a_flank_takes_the_line_between_its_ends():
     np.testing.assert_allclose(filled[:, FIRST:END], np.tile(LINE, (HEIGHT, 1)), atol=1e-5)
     assert (kinds[:, FIRST:END] == BRIDGE).all()
     assert (kinds[:, :FIRST] == KEPT).all()
+
+
+@pytest.mark.parametrize(("length", "kind"), [(3, MISMATCH), (4, BRIDGE)])
+def test_a_flank_of_four_pixels_is_the_narrowest_bridge(length, kind):
+    disparity = np.full((HEIGHT, WIDTH), GROUND, np.float32)
+    disparity[:, :FIRST], disparity[:, FIRST : FIRST + length] = TOP, np.nan
+    hole = np.isnan(disparity)
+    filled, kinds = np.where(hole, np.float32(GROUND), disparity), np.where(hole, np.uint8(MISMATCH), np.uint8(KEPT))
+    true = filled.copy()
+    true[:, FIRST : FIRST + length] = np.linspace(TOP, GROUND, length + 2)[1:-1]
+    _, found = bridge_holes(disparity, filled, kinds, *images(true))
+    assert np.mean(found[hole] == kind) > 0.9
 
 
 @pytest.mark.parametrize("noise", [0, 2])
