@@ -114,7 +114,7 @@ def test_a_regional_map_shows_which_frames_it_is_made_of(tmp_path):
 
 @pytest.mark.parametrize("sequence", [list, np.array])
 def test_the_origin_of_a_map_may_be_any_two_numbers(sequence, tmp_path):
-    maps = {name: replace(scene()[name], origin=sequence((-5.0, -1.5))) for name in ("elevation_map", "navigation_map")}
+    maps = {name: replace(scene()[name], origin=sequence((-1.5, -1.5))) for name in ("elevation_map", "navigation_map")}
     path = record_of(tmp_path / "a.rrd", [Record(START, maps)])
     labels = rows(path, "/navigation_map/cells/lines/distances", "Points2D:labels")
-    assert labels[0][2] == ["-4 m", "-2 m", "rover"]
+    assert labels[0][2] == ["0 m", "2 m", "rover"]
