@@ -1,11 +1,12 @@
 """`roverflow diff`: two results side by side."""
 
 import json
+import shutil
 
 import pytest
 
 from recordings.mcap.file import iter_decoded
-from tests.conftest import FRAMES, SMALL, roverflow, slow
+from tests.conftest import FRAMES, SMALL, chunks_of, roverflow, slow, with_broken
 
 
 @pytest.fixture(scope="module")
@@ -75,3 +76,10 @@ def test_copied_inputs_are_not_compared(traverse, fast_result, tmp_path, said):
 def test_a_log_without_results_is_refused(traverse, fast_result, tmp_path, refused):
     assert "is not a result log; give two logs that roverflow run wrote" in refused("diff", fast_result, traverse)
     assert "missing.mcap: No such file" in refused("diff", fast_result, tmp_path / "missing.mcap")
+
+
+def test_a_damaged_result_is_refused(fast_result, tmp_path, refused):
+    damaged = with_broken(shutil.copy(fast_result, tmp_path / "out.mcap"), chunks_of(fast_result)[0][0])
+    found = refused("diff", fast_result, damaged)
+    assert found.startswith(f"roverflow: {damaged}: the chunk at byte ")
+    assert found.endswith("; run the pipeline again\n")

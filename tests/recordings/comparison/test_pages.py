@@ -37,6 +37,7 @@ def test_maps_of_other_extent_and_height_are_drawn_on_one_grid_with_one_scale():
     expected = elevation_page(ElevationMap(STAMP, whole, 0.5, (1.0, -2.0), "odom"), limits)
     np.testing.assert_array_equal(drawn[0].pixels, expected.pixels)
     np.testing.assert_array_equal(drawn[1].pixels, elevation_page(other, limits).pixels)
+    np.testing.assert_array_equal(*(pixels[:, -3 * margin :] for pixels, margin in drawn[:2]))  # the scales
     assert drawn[2].pixels.shape == expected.pixels.shape
     assert (drawn[2].pixels == ONLY_ONE[2][1]).all(2).mean() > 0.2
 

@@ -60,8 +60,9 @@ def test_poses_in_another_frame_of_reference_are_no_motion(tmp_path):
             terrain = ElevationMap(stamp, {"elevation": np.zeros((3, 3), np.float32)}, 0.1, (0.0, 0.0), frame_id)
             writer.write("/nav/regional_map", ros2.grid_map(terrain), stamp)
     export(path, tmp_path)
-    for folder in ("visual_odom", "visual_odom-2"):
+    for folder, stamps in (("visual_odom", [0, 1, 2]), ("visual_odom-2", [3, 4, 5])):
         trajectory = read_tum_trajectory_file(str(tmp_path / folder / "poses.tum"))
+        np.testing.assert_allclose(trajectory.timestamps, 1e-9 * np.array(stamps))
         assert trajectory.path_length == pytest.approx(0.2)
     write_report(tmp_path / "out.html", [path])
     page = (tmp_path / "out.html").read_text()

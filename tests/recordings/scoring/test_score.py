@@ -348,6 +348,15 @@ def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, trut
         scoring.score(tmp_path / "other.mcap", truth)
 
 
+def test_padded_rows_of_a_mask_do_not_change_the_score(tmp_path, truth, frames):
+    def pad(_, image):
+        rows = np.pad(np.asarray(image.data).reshape(image.height, -1), ((0, 0), (0, 3)))
+        image.data, image.step = rows.ravel(), rows.shape[1]
+
+    other = rewrite(truth, tmp_path / "other.mcap", edit_of("truth/occlusion", "sensor_msgs/msg/Image", pad))
+    assert scored(tmp_path, other, frames).disparity == scored(tmp_path, truth, frames).disparity
+
+
 @pytest.mark.parametrize(("topic", "schema", "edit", "why"), [
     ("/occlusion", "sensor_msgs/msg/Image", lambda _, image: setattr(image, "height", 1), "cannot reshape"),
     ("/navigation_map", "nav_msgs/msg/OccupancyGrid", lambda _, grid: setattr(grid.header, "frame_id", "x"), "it is "),

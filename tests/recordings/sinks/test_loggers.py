@@ -247,6 +247,7 @@ def test_what_is_unchanged_in_a_frame_stays_drawn(tmp_path):
 
 def test_the_camera_is_drawn_at_the_sensor_of_the_cloud(rrd):
     assert rows(rrd, "/rectified/camera", "Transform3D:translation")[0][2] == [pytest.approx([0.0, 0.0, 0.9])]
+    assert rows(rrd, "/rectified/camera", "Pinhole:camera_xyz") == [(START, 0, [[3, 2, 5]])]  # right, down, forward
 
 
 def test_scalars_are_those_of_the_frame(rrd):
