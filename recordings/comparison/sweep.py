@@ -58,7 +58,7 @@ def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Arra
         top, text = bottom, "unknown"
         if not np.isnan(figure):
             top = round(bottom - figure / largest * (bottom - TOP))
-            text = f"{figure:,.0f}" if figure >= 1000 else f"{figure:.3g}"
+            text = f"{figure:,.0f}" if figure >= 999.5 else f"{figure:.3g}"
             cv2.rectangle(page, (left, top), (right, bottom), VARIANT_RGB if number else A_RGB, cv2.FILLED)
         _text(page, text, (left + right, top - 14), wide)
         _text(page, value, (left + right, bottom + 42), wide)

@@ -37,3 +37,7 @@ def test_texts_of_many_values_do_not_overlap():
     for letters in texts:
         gaps = np.diff(np.ravel(letters))[1::2]
         assert (gaps >= 2).sum() >= 25
+
+
+def test_a_figure_that_rounds_to_a_thousand_is_written_as_one():
+    np.testing.assert_array_equal(chart("p", ["b"], [1000.0, 999.7]), chart("p", ["b"], [1000.0, 1000.0]))
