@@ -159,8 +159,12 @@ def test_a_range_without_images_is_refused(traverse, result, tmp_path, refused, 
     assert out.read_bytes() == result.read_bytes()
 
 
-def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeypatch):
+@pytest.mark.parametrize("linked", [False, True])
+def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeypatch, linked):
     folder = tmp_path / "maps"
+    if linked:
+        (tmp_path / "disk").mkdir()
+        folder.symlink_to(tmp_path / "disk")
 
     def full(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -168,7 +172,7 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr("recordings.export.point_files.write_ply", full)
         assert "No space left on device" in said(1, "export", result, folder).err
-    assert not folder.exists()
+    assert folder.exists() == linked
     assert roverflow("export", result, folder) == 0
 
 

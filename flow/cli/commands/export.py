@@ -44,12 +44,15 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.folder} is a file; give the name of a folder")
     if options.folder.exists() and any(options.folder.iterdir()):
         raise UsageError(f"{options.folder} is not empty; choose another folder, because maps of two runs must not mix")
-    lost = Counter[str]()
+    lost, existed = Counter[str](), options.folder.exists()
     try:
         with writing(options.folder):
             files, faults = _written(options, results, lost)
     except BaseException:  # a partial export looks like a whole one, and blocks the next attempt
-        shutil.rmtree(options.folder, ignore_errors=True)  # the reason for the failure is the one to report
+        # Through a link, which rmtree refuses. The reason for the failure is the one to report.
+        shutil.rmtree(options.folder.resolve(), ignore_errors=True)
+        if existed:
+            options.folder.resolve().mkdir(exist_ok=True)
         raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
