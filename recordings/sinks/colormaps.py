@@ -28,8 +28,7 @@ _ORIGIN_RGB: tuple[Rgb, ...] = (  # by code
     (96, 100, 112), (150, 104, 74), (196, 70, 92), (190, 110, 190), (236, 220, 120), (226, 226, 232), (132, 186, 214),
 )  # fmt: skip
 SOURCE_LEGEND: Legend = {
-    origin: (origin.name.lower().removeprefix("out_of_").replace("_", "-"), rgb)
-    for origin, rgb in zip(PixelOrigin, _ORIGIN_RGB, strict=True)
+    origin: (origin.name.lower().replace("_", " "), rgb) for origin, rgb in zip(PixelOrigin, _ORIGIN_RGB, strict=True)
 }
 CELL_LEGEND: Legend = {
     Cell.UNKNOWN: ("unknown", UNKNOWN_RGB),
