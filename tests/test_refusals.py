@@ -320,6 +320,11 @@ sinks: [{use: recordings.McapSink}]
     assert "recordings.McapSink writes none of the streams stereo, own; name some in its 'also', or leave it out" in why
 
 
+def test_a_run_of_python_without_workers_is_refused(traverse, tmp_path):
+    with pytest.raises(UsageError, match="a run needs at least 1 worker, not 0"):
+        replay(traverse, "rover", tmp_path / "out.mcap", None, workers=0)
+
+
 def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
     log = os.fsencode(tmp_path / "Fahrt-") + b"\xfcd.mcap"
     os.link(traverse, log)

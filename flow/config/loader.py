@@ -55,7 +55,7 @@ def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> G
     UsageError
         If there is no such file.
     """
-    path = pipeline_file(name)
+    path = pipeline_file(str(name))
     text = pipeline_text(path)
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # so that stages can be beside the file that uses them

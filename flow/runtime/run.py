@@ -140,10 +140,12 @@ def run(
     Raises
     ------
     UsageError
-        The log lacks a stream that the graph or `every` needs.
+        The log lacks a stream that the graph or `every` needs, or there is no worker.
     SinkError
         An output could not be written. All outputs are closed by then.
     """
+    if workers < 1:
+        raise UsageError(f"a run needs at least 1 worker, not {workers}")
     graph = with_spare_threads(asked(fitted(graph, log), outputs), log.frames, workers)
     every = every or Every()
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))

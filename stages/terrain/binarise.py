@@ -210,7 +210,7 @@ def _shown(elevation: ElevationMap) -> Span:
 
 def _dilated(cells: Array, distance: float) -> Array:
     """The cells within `distance` cells of the mask `cells`; a diagonal neighbour is one cell away."""
-    reach = int(distance + 1e-6)
+    reach = int(min(distance, max(cells.shape)) + 1e-6)
     if not reach:
         return cells
     return cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)).view(bool)

@@ -319,6 +319,11 @@ def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, t
     assert quantity(text, unit) == pytest.approx(value)
 
 
+def test_a_pipeline_that_is_not_there_may_be_given_as_a_path(tmp_path):
+    with pytest.raises(UsageError, match=r"no pipeline '.*a.yaml': neither a file nor one of"):
+        load(tmp_path / "a.yaml")
+
+
 def test_a_binary_pipeline_file_is_refused_with_the_valid_names(tmp_path):
     (tmp_path / "t.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(UsageError, match=r"t.mcap is not text in UTF-8; give accurate, fast, .*or a YAML file"):

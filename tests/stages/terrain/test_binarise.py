@@ -189,6 +189,11 @@ def test_a_bump_higher_than_the_ground_clearance_is_a_hazard():
     assert (high.cells == Cell.FREE).mean() > 0.9
 
 
+def test_a_hazard_margin_beyond_the_map_is_that_of_the_map():
+    bumpy = map_of(np.where(np.eye(9, dtype=bool), 0.4, 0.0))
+    assert np.array_equal(decided(bumpy, hazard_margin=1e6).reason, decided(bumpy, hazard_margin=1.0).reason)
+
+
 def test_cells_within_the_hazard_margin_of_an_obstacle_are_hazards():
     rock = (np.abs(X - 2) < 0.2) & (np.abs(Y - 2) < 0.2)
     rovers = (Rover(max_slope=1.5), Rover(max_slope=1.5, max_step=1.0))  # too high for a wheel; only for the belly
