@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -89,13 +90,14 @@ def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.Sa
         return Value(mapping, place)
     if isinstance(node, yaml.SequenceNode):
         return Value([_located(item, at, loader) for item in node.value], place)
+    kind, text = node.tag.rpartition(":")[2], node.value
+    if (kind == "int" and re.match(r"[-+]?0[\d_bx]", text)) or (kind in ("int", "float") and ":" in text):
+        other = "octal, hexadecimal, binary or of base 60"
+        raise place.error(f"YAML reads {reprlib.repr(text)} as {other}; write a decimal number without leading zeros")
     try:
-        value = loader.construct_object(node)
-        str(value)  # no message can contain a whole number of thousands of digits
-        return Value(value, place)
+        return Value(loader.construct_object(node), place)
     except (AttributeError, LookupError, ValueError) as error:  # in the form of a type, but no such value
-        kind = node.tag.rpartition(":")[2]
-        raise place.error(f"{reprlib.repr(node.value)} looks like a YAML {kind} but is none; quote it") from error
+        raise place.error(f"{reprlib.repr(text)} looks like a YAML {kind} but is none; quote it") from error
 
 
 def _size(node: Any, sizes: dict[int, int]) -> int:

@@ -37,8 +37,10 @@ class FoundFiles:
 
 
 def find_files(given: Path | str | Sequence[Path | str]) -> FoundFiles:
-    """The files of a log. Raises LogError for a folder without a recording or with several."""
+    """The files of a log. Raises LogError for no file, and for a folder without a recording or with several."""
     paths = [Path(given)] if isinstance(given, Path | str) else list(dict.fromkeys(map(Path, given)))
+    if not paths:
+        raise LogError("the list of files is empty; give a log")
     folders = {path: _files_of(path) for path in paths if path.is_dir()}
     named = [path for path in paths if path not in folders]
     for path in named:

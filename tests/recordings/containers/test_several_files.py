@@ -171,3 +171,8 @@ def test_what_was_unpacked_is_deleted(sample, tmp_path, monkeypatch):
     with open_recording(folder):
         assert len(list((tmp_path / "temporary").iterdir())) == 2
     assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_no_file_is_refused():
+    with pytest.raises(LogError, match="the list of files is empty; give a log"):
+        open_recording([])
