@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import pickle
 import re
-from dataclasses import Field, dataclass
+from dataclasses import Field, dataclass, fields
 from functools import cache
 from typing import Any, Self, get_args, get_type_hints
 
@@ -26,10 +26,12 @@ class Stage(Checked):
 
     def __new__(cls, *given: Any, **named: Any) -> Self:
         """Raises StageError where an input of the work is given instead of parameters."""
-        if any(hasattr(item, "stamp") for item in (*given, *named.values())):
+        inputs = [type(item).__name__ for item in (*given, *named.values()) if hasattr(item, "stamp")]
+        if any(name not in str([known.type for known in fields(cls)]) for name in inputs):
             _, *ports = inspect.signature(cls.__call__).parameters.values()
-            needed = ", ".join(port.name for port in ports if port.default is port.empty)
-            raise StageError(f"{cls.__name__} takes parameters; use {cls.__name__}()({needed})")
+            needed = [port for port in ports if port.default is port.empty]
+            call = ", ".join(f"{port.name}=" * (port.kind is port.KEYWORD_ONLY) + port.name for port in needed)
+            raise StageError(f"{cls.__name__} takes parameters; use {cls.__name__}()({call})")
         return super().__new__(cls)
 
     def __init_subclass__(cls) -> None:
@@ -79,7 +81,8 @@ _types = cache(get_type_hints)  # of the inputs of a stage
 
 def check_types(stage: Stage, **inputs: Any) -> None:
     """Raise StageError for an input that is not of the type that `__call__` names, such as a bare array."""
-    kinds = _types(type(stage).__call__)
+    # A class made from a stage may have other inputs.
+    kinds = _types(next(vars(own)["__call__"] for own in reversed(type(stage).__mro__) if "__call__" in vars(own)))
     for port, item in inputs.items():
         if not isinstance(item, kinds[port]):
             wanted = next(iter(get_args(kinds[port])), kinds[port]).__name__

@@ -1,6 +1,6 @@
 """Stages: `help()` shows the meaning of every parameter, and inputs that do not belong together are refused."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -85,8 +85,26 @@ def test_inputs_that_do_not_belong_together_are_refused(stage, inputs, message):
     (lambda: stages.Match(frame=FRAME), "Match takes parameters; use Match()(frame)"),
     (lambda: stages.Halve(FRAME), "Halve takes parameters; use Halve()(frame)"),
     (lambda: stages.Upsample(FRAME, disparity()), "Upsample takes parameters; use Upsample()(frame, disparity)"),
+    (lambda: stages.MapRegion(FRAME), "MapRegion takes parameters; use MapRegion()(region, state=state)"),
 ])  # fmt: skip
 def test_a_stage_that_gets_its_input_as_a_parameter_says_how_to_call_it(make, call):
     with pytest.raises(StageError) as raised:
         make()
     assert str(raised.value) == call
+
+
+@dataclass(frozen=True)
+class Colder(stages.MeasureNoise):
+    """A stage made from another, with data as a parameter and an input of another type."""
+
+    warm: stages.ImageNoise | None = None
+
+    def __call__(self, image: np.ndarray) -> stages.ImageNoise:
+        return super().__call__(replace(FRAME, left=image))
+
+
+def test_a_stage_made_from_another_may_have_data_as_a_parameter_and_other_inputs():
+    noise = stages.MeasureNoise()(FRAME)
+    assert np.array_equal(Colder(warm=noise)(IMAGE).sigma, noise.sigma)
+    with pytest.raises(StageError, match=r"use Colder\(\)\(image\)"):
+        Colder(FRAME)
