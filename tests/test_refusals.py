@@ -163,7 +163,7 @@ def test_a_range_without_images_is_refused(traverse, result, tmp_path, refused, 
 def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeypatch, linked):
     folder = tmp_path / "maps"
     if linked:
-        (tmp_path / "disk").mkdir()
+        (tmp_path / "disk").mkdir(mode=0o700)
         folder.symlink_to(tmp_path / "disk")
 
     def full(*_):
@@ -173,6 +173,7 @@ def test_a_failed_export_does_not_block_the_next(result, tmp_path, said, monkeyp
         patch.setattr("recordings.export.point_files.write_ply", full)
         assert "No space left on device" in said(1, "export", result, folder).err
     assert folder.exists() == linked
+    assert not linked or folder.stat().st_mode & 0o777 == 0o700
     assert roverflow("export", result, folder) == 0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,10 +50,11 @@ def run(options: argparse.Namespace) -> int:
         with writing(options.folder):
             files, faults = _written(options, results, lost)
     except BaseException:  # a partial export looks like a whole one, and blocks the next attempt
-        # Through a link, which rmtree refuses. The reason for the failure is the one to report.
-        shutil.rmtree(options.folder.resolve(), ignore_errors=True)
-        if existed:
-            options.folder.resolve().mkdir(exist_ok=True)
+        with suppress(OSError):  # the reason for the failure is the one to report
+            for made in options.folder.glob("*"):
+                shutil.rmtree(made) if made.is_dir() else made.unlink()
+            if not existed:
+                options.folder.rmdir()
         raise
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
