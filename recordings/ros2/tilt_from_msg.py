@@ -225,7 +225,7 @@ class JoinedAngles:
         self._rolls = deque[tuple[Any, int]]()  # later than it, with their log times
 
     def add_roll(self, message: Any, log_time: int) -> None:
-        """Keep a roll until the next pitch. Raises LogError for those that wait in vain."""
+        """Keep a roll until the next pitch. Raises LogError for rolls that no pitch has followed for 3 s."""
         self._angles.roll(message)  # raises LogError
         self._rolls.append((message, log_time))
         count, since = len(self._rolls), self._rolls[0][1]

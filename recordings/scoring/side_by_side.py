@@ -13,7 +13,7 @@ from recordings.ros2.from_msg import stamp_of
 from stages.data import LEVEL_FRAME
 
 MAX_DELAY = 5_000_000_000  # ns between the header stamps of messages that a log has in another order
-_AHEAD = 32  # messages, over two frames of the truth, among which one with a wrong later stamp does not count
+_AHEAD = 32  # messages, over two frames of the truth; a wrong later stamp of one of them delays no other
 
 Messages = Iterator[tuple[str, int, Any]]  # topic, log time in ns, message
 
@@ -35,7 +35,7 @@ def frames(*logs: Messages) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def _stamped(messages: Messages) -> Iterator[tuple[int, int, str, Any]]:
-    """The first header stamp of a message and those ahead, and its own stamp, topic and message."""
+    """The earliest header stamp of a message and those ahead, and its own stamp, topic and message."""
     items = (
         (stamp_of(item.header), topic, item)
         for topic, _, message in messages

@@ -83,7 +83,7 @@ class DecodedTopics:
         self.undecodable_channels: dict[int, str] = {}
         self.schemas: dict[str, str] = {}
         self._ahead: dict[str, int] = {}
-        self._last: tuple[bytes | memoryview, Any] = b"", None  # data and message
+        self._last: tuple[Any, Any] = None, None  # data and message
         weights, unpacking, dense = dict[MessageSchema, int](), Unpacking(), self._dense_topics(max_rate)
         for place, (number, channel) in enumerate(file.channels.items()):
             if place >= MAX_CHANNELS:
