@@ -1,4 +1,4 @@
-"""Checks of the arrays that enter a data type; from then on they are read-only.
+"""Checks of what enters a data type. Arrays are read-only from then on.
 
 Errors name the type and its field, because logs as well as stages make these types.
 """
@@ -6,8 +6,11 @@ Errors name the type and its field, because logs as well as stages make these ty
 from __future__ import annotations
 
 import math
-from numbers import Integral
-from typing import Any
+from dataclasses import fields, is_dataclass
+from functools import cache
+from numbers import Integral, Real
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -17,6 +20,9 @@ from flow.contracts import StageError
 Array = NDArray[Any]
 Span = tuple[slice, slice]  # rows and columns
 
+_TAKEN: dict[type, Any] = {  # what a field of a type may be instead; `publish` checks arrays
+    int: Integral, float: Real, bool: bool | np.bool_, tuple: tuple | list | np.ndarray, np.ndarray: object,
+}  # fmt: skip
 _UNIT, _MAX_SKEW = np.eye(3), 1e-6 + 1e-5 * np.eye(3)  # what a rotation times its transpose may differ from the unit
 
 
@@ -53,11 +59,27 @@ def publish_vector(owner: object, name: str, shape: tuple[int, ...], finite: boo
     object.__setattr__(owner, name, read_only(values))
 
 
-def publish_stamp(owner: Any) -> None:
-    """Check that the field `stamp` is a whole number of nanoseconds, and make it an int."""
+def publish_plain(owner: Any) -> None:
+    """Check the fields that are no arrays by their annotations, and make `stamp`, whole nanoseconds, an int."""
     if not isinstance(owner.stamp, Integral):
         raise StageError(f"{type(owner).__name__}.stamp must be whole nanoseconds, not {owner.stamp!r}")
     object.__setattr__(owner, "stamp", int(owner.stamp))
+    for name, (wanted, taken) in _kinds(owner.__class__).items():
+        if not isinstance(value := getattr(owner, name), taken):
+            raise StageError(f"{type(owner).__name__}.{name} must be a {wanted}, not a {type(value).__name__}")
+
+
+@cache
+def _kinds(owner: type) -> dict[str, tuple[str, tuple[Any, ...]]]:
+    """The type of each field of a data type by name, and what it may be; also for a class made from a data type."""
+    base, found = next(own for own in reversed(owner.__mro__) if is_dataclass(own)), {}
+    hints = get_type_hints(base)
+    for name in (known.name for known in fields(base) if known.init):
+        parts = get_args(hints[name]) if isinstance(hints[name], UnionType) else (hints[name],)
+        kind, *others = (get_origin(part) or part for part in parts)
+        wanted = f"{kind.__module__.partition('.')[0]}.{kind.__name__}".removeprefix("builtins.")
+        found[name] = wanted, (_TAKEN.get(kind, kind), *others)
+    return found
 
 
 def check_resolution(owner: Any) -> None:

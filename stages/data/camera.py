@@ -12,7 +12,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from flow.contracts import StageError
-from stages.data.arrays import Array, publish, publish_image, publish_stamp, publish_vector
+from stages.data.arrays import Array, publish, publish_image, publish_plain, publish_vector
 
 CALIBRATION_RTOL = 1e-3  # by which focal lengths or cy of a rectified pair may differ: a pixel at 1000 px
 _OPENCV = (0, 4, 5, 8, 12, 14)  # numbers of coefficients; they define the model, whatever a driver calls it
@@ -195,7 +195,7 @@ class CameraImage:
     rectified: bool
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish_image(self, "pixels")
 
     def pair_with(self, right: CameraImage) -> StereoFrame:
@@ -232,11 +232,9 @@ class StereoFrame:
     camera: StereoCamera
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish_image(self, "left")
         publish_image(self, "right")
-        if not isinstance(self.camera, StereoCamera):
-            raise StageError(f"StereoFrame.camera must be a stages.StereoCamera, not a {type(self.camera).__name__}")
         if self.left.shape[:2] != self.right.shape[:2]:
             raise StageError(f"StereoFrame: left is {self.left.shape}, right is {self.right.shape}")
         if self.left.dtype != self.right.dtype:
@@ -275,5 +273,5 @@ class ImageNoise:
     sigma: Array
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish(self, "sigma", (256,), np.float32)

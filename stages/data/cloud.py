@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stages.data.arrays import Array, check_resolution, publish, publish_stamp, rows_of
+from stages.data.arrays import Array, check_resolution, publish, publish_plain, rows_of
 from stages.data.motion import Transform
 from stages.data.pixel_validity import PixelOrigin
 
@@ -57,7 +57,7 @@ class PointCloud:
     tilt_sigma: float = 0.0
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish(self, "points", (None, 3), np.float32)
         n = len(self.points)
         publish(self, "colors", (n, 3), np.uint8)
@@ -102,7 +102,7 @@ class VoxelMap:
     frame_id: str
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         check_resolution(self)
         publish(self, "index", (None, 3), np.int32)
         publish(self, "colors", (len(self.index), 3), np.uint8)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.data.arrays import Array, publish, publish_stamp
+from stages.data.arrays import Array, publish, publish_plain
 from stages.data.camera import StereoCamera
 
 
@@ -55,7 +55,7 @@ class Disparity:
     costs: Array | None = None
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish(self, "pixels", (None, None), np.float32)
         publish(self, "source", self.pixels.shape, np.uint8)
         publish(self, "confidence", self.pixels.shape, np.float32)
@@ -84,4 +84,4 @@ class MatchHealth:
     near: float
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)

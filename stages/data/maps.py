@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from flow.contracts import StageError
-from stages.data.arrays import Array, check_resolution, publish, publish_stamp, read_only
+from stages.data.arrays import Array, check_resolution, publish, publish_plain, read_only
 from stages.data.motion import Transform
 
 LEVEL_FRAME = "level"
@@ -95,7 +95,7 @@ class ElevationMap:
     shape: tuple[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         check_resolution(self)
         layers = {name: np.asarray(layer) for name, layer in self.layers.items()}
         if "elevation" not in layers:
@@ -141,7 +141,7 @@ class NavigationMap:
     frame_id: str
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         check_resolution(self)
         publish(self, "cells", (None, None), np.int8)
         publish(self, "reason", self.cells.shape, np.uint8)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from flow.contracts import StageError
-from stages.data.arrays import Array, check_rotation, publish_stamp, publish_vector
+from stages.data.arrays import Array, check_rotation, publish_plain, publish_vector
 from stages.data.covariance import translated_covariance
 from stages.data.rotations import matrix_of, product, quaternion_of, unit
 
@@ -86,7 +86,7 @@ class Tilt:
     filtered: bool = False
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish_vector(self, "up", (3,))
         if self.sigma is not None and not 0 <= self.sigma < np.inf:
             raise StageError(f"Tilt.sigma must be at least 0 and finite, not {self.sigma}")
@@ -152,7 +152,7 @@ class Pose:
     covariance: Array | None = None
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish_vector(self, "position", (3,))
         publish_vector(self, "quaternion", (4,))
         if self.covariance is not None:
@@ -213,7 +213,7 @@ class Mount:
     base_from_camera: Transform | None = None
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish_vector(self, "camera_from_inclinometer", (3, 3))
         check_rotation(self.camera_from_inclinometer, "Mount.camera_from_inclinometer")
 
@@ -251,7 +251,7 @@ class CameraMotion:
     lost: str = ""
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         publish_vector(self, "covariance", (6, 6))
 
 
@@ -281,7 +281,7 @@ class TiltHealth:
     judgement: str
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
 
 
 def _fraction(first: int, last: int, stamp: int) -> float:

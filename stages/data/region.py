@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stages.data.arrays import check_resolution, publish_stamp
+from stages.data.arrays import check_resolution, publish_plain
 from stages.data.motion import Transform
 from stages.data.tiles import Tiles
 
@@ -38,7 +38,7 @@ class Region:
     has_ceiling: bool
 
     def __post_init__(self) -> None:
-        publish_stamp(self)
+        publish_plain(self)
         check_resolution(self)
 
     @property

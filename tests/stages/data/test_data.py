@@ -96,6 +96,7 @@ class Free(Stage):
     length: float = parameter(1.0, "any length", unit="m")
 
 
+TERRAIN = ElevationMap(0, {"elevation": FLAT}, F32(0.1), np.zeros(2), "odom")  # type: ignore[arg-type]
 WILD = np.nan, np.inf, -np.inf, F32("nan")
 SIZES = 0.0, -0.05, np.nan, np.inf
 NO_ROTATIONS = 2 * np.eye(3), np.diag([1.0, 1, -1]), np.ones((3, 3)), np.zeros((3, 3))
@@ -116,6 +117,11 @@ REFUSALS = [
      lambda side: StereoFrame(0, *np.zeros((2, side, side), U8), CAMERA)),
     ("StereoFrame.camera must be a stages.StereoCamera", [None, {}],
      lambda bad: replace(FRAME, camera=bad)),
+    ("ElevationMap.resolution must be a float, not a str", ["5"], lambda bad: replace(TERRAIN, resolution=bad)),
+    ("ElevationMap.origin must be a tuple, not a int", [0], lambda bad: replace(TERRAIN, origin=bad)),
+    ("Mount.base_from_camera must be a stages.Transform, not a ndarray", [np.eye(4)],
+     lambda bad: Mount(0, np.eye(3), bad)),
+    ("Tilt.frame_id must be a str, not a int", [5], lambda bad: Tilt(0, np.array([0, 0, 1.0]), bad)),
     ("StereoCamera.fx must be a number, not", ["500", None], lambda bad: replace(CAMERA, fx=bad)),
     (r"ElevationMap layer 'elevation' must be \(rows, cols\)", [3, (2, 3, 1)],
      lambda shape: ElevationMap(0, {"elevation": np.zeros(shape, F32)}, 0.05, (0.0, 0.0), "level")),
