@@ -12,6 +12,7 @@ from operator import or_
 from types import UnionType
 from typing import Any, ClassVar, Protocol, Union, get_args, get_origin
 
+MAX_WORKERS = 1024  # of a run
 MIN_ALIKE = 2 / 3  # of the letters of two names that are near; 'rnu' and 'run' share as many
 
 

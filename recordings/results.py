@@ -63,7 +63,7 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     >>> for frame in read_result("out.mcap", ["navigation_map"]):  # doctest: +SKIP
     ...     print(frame.stamp, (frame.items["navigation_map"].cells == 100).sum())
     """
-    path, streams = Path(path), [streams] if isinstance(streams, str) else streams
+    path, streams = Path(path), [streams] if isinstance(streams, str) else [*streams]
     check_profile(path, facts_of(path, "a log that roverflow run wrote"))
     with McapFile(path) as log:
         schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}

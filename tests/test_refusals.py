@@ -321,9 +321,16 @@ sinks: [{use: recordings.McapSink}]
     assert "recordings.McapSink writes none of the streams stereo, own; name some in its 'also', or leave it out" in why
 
 
-def test_a_run_of_python_without_workers_is_refused(traverse, tmp_path):
-    with pytest.raises(UsageError, match="a run needs at least 1 worker, not 0"):
-        replay(traverse, "rover", tmp_path / "out.mcap", None, workers=0)
+@pytest.mark.parametrize("workers", [0, 10**9])
+def test_a_run_of_python_without_workers_or_with_too_many_is_refused(traverse, tmp_path, workers):
+    with pytest.raises(UsageError, match=f"a run needs 1 to 1024 workers, not {workers}"):
+        replay(traverse, "rover", tmp_path / "out.mcap", None, workers=workers)
+
+
+def test_a_run_of_python_takes_a_number_of_frames(traverse, tmp_path):
+    assert replay(traverse, "fast", tmp_path / "out.mcap", None, overrides=["disparities=64"], every=2)[
+        "frames_left_out"
+    ]
 
 
 def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):

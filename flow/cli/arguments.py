@@ -8,6 +8,7 @@ import re
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from flow.contracts import MAX_WORKERS
 from flow.runtime.frame_selection import Every
 
 if TYPE_CHECKING:
@@ -15,9 +16,8 @@ if TYPE_CHECKING:
 
     At = float | str | np.datetime64 | np.timedelta64
 
-_MAX_WORKERS = 1024
 _MIN_MEMORY_MB = 500
-_MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
+MAX_SECONDS = 9e9  # int64 nanoseconds hold no more
 AT = "seconds after the log's first message, a time copied from the viewer, or cursor: the time in the open viewer"
 CURSOR = "cursor"  # the instant of a viewer that is open
 
@@ -36,8 +36,8 @@ def count(text: str, low: int = 1) -> int:
 def workers(text: str) -> int:
     """A number of worker threads."""
     value = count(text)
-    if value > _MAX_WORKERS:
-        raise argparse.ArgumentTypeError(f"must be at most {_MAX_WORKERS}, not '{text}'; the cores are enough")
+    if value > MAX_WORKERS:
+        raise argparse.ArgumentTypeError(f"must be at most {MAX_WORKERS}, not '{text}'; the cores are enough")
     return value
 
 
@@ -58,9 +58,9 @@ def seconds(text: str) -> float:
         value = quantity(text if text[-1:].isalpha() else f"{text} s", "s")
     except ValueError:
         value = math.nan
-    if not 0 <= value <= _MAX_SECONDS:
+    if not 0 <= value <= MAX_SECONDS:
         raise argparse.ArgumentTypeError(
-            f"must be seconds after the log's first message, at most {_MAX_SECONDS:g}, not '{text}'"
+            f"must be seconds after the log's first message, at most {MAX_SECONDS:g}, not '{text}'"
         )
     return value
 

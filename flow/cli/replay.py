@@ -20,7 +20,7 @@ ARROW_EXTRA = "pandas"  # which the library of recordings imports, where it is i
 
 def replay(
     log: Path | str | Sequence[Path | str],
-    pipeline: str,
+    pipeline: str | Path,
     out: Path | str,
     rrd: Path | str | None,
     *,
@@ -28,7 +28,7 @@ def replay(
     workers: int = 2,
     start: float | None = None,
     end: float | None = None,
-    every: Every | None = None,
+    every: Every | int | None = None,
     on_frame: Callable[[bool], None] | None = None,
     live_pipe: int = 0,
     profile: str | None = None,
@@ -42,7 +42,7 @@ def replay(
     log, pipeline, out, rrd, overrides, workers, start, end, profile, desk, with_inputs
         As of `roverflow run`; `overrides` has the texts of --set.
     every
-        `flow.runtime.frame_selection.Every(frames=2)` or `Every(metres=0.5)`.
+        2 for every second frame, or `flow.runtime.frame_selection.Every(metres=0.5)`.
     on_frame
         Called after each frame, with whether it is complete, in place of a progress bar.
     live_pipe
@@ -58,6 +58,7 @@ def replay(
     from flow.runtime.run import run
     from stages.kernel_loading import loading_kernels
 
+    every = every if every is None or isinstance(every, Every) else Every(every)
     graph = pipelines.load(pipeline, overrides)
     logs = (Path(log),) if isinstance(log, Path | str) else tuple(map(Path, log))
     files = _files(graph, logs)

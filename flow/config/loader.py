@@ -35,7 +35,7 @@ _KEYS = ("settings", "source", "templates", "streams", "sinks")
 _BEGIN = f"begin with a copy of {SHIPPED / 'rover.yaml'}, and change its source"
 
 
-def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> Graph:
+def load(name: str | Path, overrides: Iterable[str] = (), with_sinks: bool = True) -> Graph:
     """The checked graph of a pipeline.
 
     Parameters
@@ -55,7 +55,9 @@ def load(name: str, overrides: Iterable[str] = (), with_sinks: bool = True) -> G
     UsageError
         If there is no such file.
     """
-    path = pipeline_file(str(name))
+    if isinstance(overrides, str):
+        raise UsageError(f"the overrides must be a list of texts, such as ['{overrides}']")
+    path = pipeline_file(name)
     text = pipeline_text(path)
     if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
         sys.path.append(str(path.parent.resolve()))  # so that stages can be beside the file that uses them
@@ -80,13 +82,14 @@ def pipeline_text(path: Path) -> str:
         raise UsageError(f"cannot read the pipeline {path}: {error}") from error
 
 
-def pipeline_file(name: str, templates: bool = False) -> Path:
+def pipeline_file(name: str | Path, templates: bool = False) -> Path:
     """The file of the pipeline `name`, which `load` accepts; a copy of it loads from any folder.
 
     templates: whether `name` may also be a template that ships.
     """
     folders = [SHIPPED, SHIPPED / "parts"] if templates else [SHIPPED]
     known = {file.stem: file for folder in folders for file in sorted(folder.glob("*.yaml"))}
+    name = str(name)
     if name not in known and not Path(name).is_file():
         what = "pipeline or template" if templates else "pipeline"
         raise UsageError(f"no {what} '{name}': neither a file nor one of {', '.join(known)}{nearest(name, known)}")

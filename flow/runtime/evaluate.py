@@ -44,6 +44,8 @@ def evaluate(
     >>> round(float(np.nanmedian(streams["disparity"].pixels)), 1)
     6.0
     """
+    if not isinstance(graph, Graph):
+        raise UsageError(f"the graph must be what flow.config.loader.load returns, not a {type(graph).__name__}")
     plan, lacking = dict[str, tuple[Node, dict[str, str]]](), dict[str, str]()  # lacking: stream -> the one to give
     known = [*graph.source_streams, *(node.name for node in graph.nodes)]
     for name in (wanted, *given):

@@ -11,16 +11,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from flow.errors import UsageError
+from flow.parameters import Checked, parameter
 
 MAX_POSE_AGE = 2_000_000_000  # ns; the place of a frame whose last pose is older is unknown, and the frame is taken
 
 
 @dataclass(frozen=True)
-class Every:
+class Every(Checked):
     """What to take: every `frames`-th frame; or, with `metres`, a frame that far from the last one taken."""
 
-    frames: int = 1
-    metres: float | None = None
+    frames: int = parameter(1, "n, to take every n-th frame", low=1)
+    metres: float | None = parameter(None, "distance from the last frame taken to the next", unit="m", low=0)
 
     def __str__(self) -> str:
         return str(self.frames) if self.metres is None else f"{self.metres:g}m"

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from flow.contracts import Event, Finding, Log, Sink, Verdict
+from flow.contracts import MAX_WORKERS, Event, Finding, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.bottleneck import usable_cores
 from flow.runtime.engine import Engine
@@ -144,8 +144,8 @@ def run(
     SinkError
         An output could not be written. All outputs are closed by then.
     """
-    if workers < 1:
-        raise UsageError(f"a run needs at least 1 worker, not {workers}")
+    if not 1 <= workers <= MAX_WORKERS:
+        raise UsageError(f"a run needs 1 to {MAX_WORKERS} workers, not {workers}")
     graph = with_spare_threads(asked(fitted(graph, log), outputs), log.frames, workers)
     every = every or Every()
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))

@@ -279,7 +279,7 @@ class McapLog:
         if low is not None and low > self.file.end:
             raise LogError(f"{self.path} is {length:.3f} s long; start {self.start} s is after its end")
         if low is not None and high is not None and low >= high:
-            raise LogError(f"start {self.start} s is not before end {self.end} s; exchange them")
+            raise LogError(f"start {self.start} s is not before end {self.end} s; give a smaller start or a larger end")
 
     def _check_images(self) -> None:
         """Refuse a range without a left image."""

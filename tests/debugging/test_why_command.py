@@ -13,6 +13,7 @@ from flow.cli.debugging.explanation import why
 from flow.cli.debugging.instants import part_of
 from flow.cli.debugging.regional_explanation import why_regional
 from flow.cli.debugging.result_input import graph_of
+from flow.errors import UsageError
 from recordings import McapSource
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
@@ -135,6 +136,17 @@ def test_the_nearest_cell_of_fast_was_not_searched_at_full_size(traverse, fast_r
 def test_what_cannot_be_explained_is_refused(traverse, fast_result, refused, words, why_not):
     log = (traverse,) if "--log" in words else ()
     assert why_not in refused("why", fast_result, "--at", AT, *words, *log)
+
+
+@pytest.mark.parametrize(("given", "why_not"), [
+    ({"at": "soon", "cell": (3, 0)}, "an instant must be seconds after the log's first message, .* not 'soon'"),
+    ({"at": np.inf, "cell": (3, 0)}, "an instant must be .* not inf"),
+    *(({"at": AT, "cell": odd}, "the cell must be two finite numbers, not") for odd in ("3,0", (1, 2, 3), (np.nan, 0))),
+    ({"at": AT, "pixel": ("a", 2)}, r"the pixel must be two finite numbers, not \('a', 2\)"),
+])  # fmt: skip
+def test_a_question_of_python_without_an_answer_is_refused(traverse, fast_result, given, why_not):
+    with pytest.raises(UsageError, match=why_not):
+        why(fast_result, **given, log=traverse)
 
 
 def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result, stamp, said):

@@ -35,6 +35,10 @@ def test_one_stream_may_be_given_by_its_name_alone(result):
     assert all(set(frame.items) == {"pose"} for frame in read_result(result, "pose"))
 
 
+def test_streams_may_be_given_one_after_the_other(result):
+    assert set(next(read_result(result, (name for name in ("pose", "disparity")))).items) == {"pose", "disparity"}
+
+
 def test_other_logs_and_unknown_streams_are_refused(result, traverse):
     with pytest.raises(LogError, match="is not a result log"):
         next(read_result(traverse))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -165,7 +166,7 @@ def why(
     """
     from stages.kernel_loading import loading_kernels
 
-    result = Path(result)
+    result, cell, pixel = Path(result), two_numbers("cell", cell), two_numbers("pixel", pixel)
     graph = graph_of(result)
     rules = {node.name: node for node in graph.nodes if isinstance(node.actor, Binarise)}
     if stream not in rules:
@@ -318,6 +319,14 @@ def index_of(navigation: NavigationMap, x: float, y: float) -> tuple[int, int] |
     row, col = (math.floor(offset / navigation.resolution) for offset in offsets)
     rows, cols = navigation.cells.shape
     return (row, col) if 0 <= row < rows and 0 <= col < cols else None
+
+
+def two_numbers(what: str, given: Any) -> Any:
+    """Two finite numbers as they are given, or None. Raises UsageError for anything else."""
+    with suppress(TypeError, ValueError):
+        if given is None or np.isfinite(np.array(given, float)).tolist() == [True, True]:
+            return given
+    raise UsageError(f"the {what} must be two finite numbers, not {given!r}")
 
 
 def _extent(navigation: NavigationMap) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flow.cli.arguments import MAX_SECONDS
 from flow.contracts import LossReason
 from flow.errors import UsageError
 from recordings.containers.container import RawMessage
@@ -110,9 +111,12 @@ def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
 
 
 def ns_of(at: Instant, begin: int) -> int:
-    """An instant in ns, in a log that begins at `begin`, ns."""
-    if isinstance(at, float | int):
+    """An instant in ns, in a log that begins at `begin`, ns. Raises UsageError for what is none."""
+    if isinstance(at, float | int) and abs(at) < MAX_SECONDS:
         return begin + round(at * 1e9)
+    if not isinstance(at, np.datetime64 | np.timedelta64):
+        what = "seconds after the log's first message, a numpy.datetime64 or a numpy.timedelta64"
+        raise UsageError(f"an instant must be {what}, not {at!r}")
     value = int(at.astype(f"{at.dtype.kind}8[ns]").astype(np.int64))
     if isinstance(at, np.timedelta64):  # of the first day on which the log has it
         start = begin - MARGIN

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from flow.cli.debugging.explanation import CellExplanation, centre_of, index_of, verdict_at
+from flow.cli.debugging.explanation import CellExplanation, centre_of, index_of, two_numbers, verdict_at
 from flow.cli.debugging.instants import Instant, ns_of
 from flow.cli.debugging.result_input import graph_of, input_of
 from flow.errors import UsageError
@@ -54,7 +54,7 @@ class RegionalExplanation(CellExplanation):
 
 
 def why_regional(
-    result: Path,
+    result: Path | str,
     at: Instant,
     cell: tuple[float, float],
     *,
@@ -87,6 +87,7 @@ def why_regional(
     UsageError
         If the input log is not there or is another one, the result has no such map, or the cell is outside of it.
     """
+    result, cell = Path(result), two_numbers("cell", cell)
     graph = graph_of(result, with_sinks=True)
     node = next((node for node in graph.nodes if node.name == stream and isinstance(node.actor, Binarise)), None)
     if node is None:

@@ -70,3 +70,8 @@ def test_what_cannot_be_made_is_refused_in_one_sentence(tmp_path, given, wanted,
     with pytest.raises(UsageError) as raised:
         evaluate(graph(tmp_path), given, wanted)
     assert str(raised.value) == sentence
+
+
+def test_a_name_in_place_of_a_pipeline_is_refused():
+    with pytest.raises(UsageError, match=r"must be what flow\.config\.loader\.load returns, not a str"):
+        evaluate("rover", GIVEN, "sum")  # type: ignore[arg-type]

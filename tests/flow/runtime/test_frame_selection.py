@@ -46,6 +46,12 @@ def test_frames_of_unknown_place_are_taken(tmp_path):
     assert taken(tmp_path, [], Every(metres=0.5), frames=3) == [0, 1, 2]
 
 
+@pytest.mark.parametrize("given", [{"frames": 0}, {"frames": "2"}, {"metres": -1.0}, {"metres": float("nan")}])
+def test_a_selection_without_a_meaning_is_refused(given):
+    with pytest.raises(ValueError, match=rf"Every\.{next(iter(given))} must be "):
+        Every(**given)
+
+
 def test_a_stretch_needs_odometry(tmp_path):
     log = Log(traverse(3), missing={"way": "the log has no odometry"})
     with pytest.raises(UsageError, match=r"--every 0\.5m needs odometry: the log has no odometry; .* --every 2"):

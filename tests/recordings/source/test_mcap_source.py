@@ -101,7 +101,7 @@ def test_a_range_contains_complete_frames_and_their_tilts(sample):
     assert stamps["inclinometer"] == [number * PERIOD for number in range(FRAMES)]
     with pytest.raises(LogError, match=r"sample\.mcap is 0\.400 s long; start 9 s is after its end"):
         McapSource().open(sample, start=9)
-    with pytest.raises(LogError, match=r"start 0\.3 s is not before end 0\.2 s"):
+    with pytest.raises(LogError, match=r"start 0\.3 s is not before end 0\.2 s; give a smaller start or a larger end"):
         McapSource().open(sample, start=0.3, end=0.2)
 
 
