@@ -16,6 +16,9 @@ from typing import Any, Literal, Union, get_args, get_origin
 from flow.units import as_written, check_bare, quantity
 
 _WORDS = {str: "a text", bool: "true or false", list: "a list", dict: "a mapping", Mapping: "a mapping"}
+_PLAIN: dict[str, tuple[Any, str]] = {  # by annotation
+    "str": (str, "a text"), "bool": (bool, "true or false"), "tuple[str, ...]": ((tuple, list), "a tuple of texts"),
+}  # fmt: skip
 
 
 def parameter(
@@ -61,9 +64,22 @@ def check_parameters(item: Any) -> None:
     for known in fields(item):
         if known.init:
             try:
+                _check_plain(getattr(item, known.name), known)
                 check(getattr(item, known.name), known)
             except ValueError as error:
                 raise ValueError(f"{type(item).__name__}.{known.name} {error}") from None
+
+
+def _check_plain(value: Any, known: Field[Any]) -> None:
+    """Raise ValueError for a value that is no text, truth value or tuple of texts where the parameter is one."""
+    kind, wanted = _PLAIN.get(_kind_of(known), (object, ""))
+    if not isinstance(value, kind) and (value is not None or known.default is not None):
+        raise ValueError(f"must be {wanted}, not {value!r}")
+
+
+def _kind_of(known: Field[Any]) -> str:
+    """The name of the type of a parameter, without None."""
+    return getattr(known.type, "__name__", str(known.type)).removesuffix(" | None")
 
 
 class Checked:
@@ -87,9 +103,9 @@ def check(value: Any, known: Field[Any], given: Any = None) -> None:
         raise ValueError(f"must be one of {', '.join(map(str, choices))}, not {shown}")
     if is_dataclass(known.default) and not isinstance(value, type(known.default)):
         raise ValueError(f"must be a {type(known.default).__name__}, not {shown!r}")
-    is_whole = known.type in ("int", "int | None", int)
+    is_whole, is_real = (_kind_of(known) == name for name in ("int", "float"))
     is_number = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not is_number and (is_whole or low is not None or high is not None):
+    if not is_number and (is_whole or is_real or low is not None or high is not None):
         raise ValueError(f"must be a number{of_unit}, not {shown!r}")
     if is_number and not _is_finite(value):
         raise ValueError(f"must be a finite number{of_unit}, not {shown}")

@@ -46,10 +46,10 @@ def quantity(text: str, unit: str) -> float:
         check_bare(number, unit)
         return number
     wanted, base = UNITS.get(unit, (unit, 1.0))
-    if given not in UNITS:
+    if given not in (*UNITS, unit):
         known = [name for name, (kind, _) in UNITS.items() if kind == wanted and name] or [unit or "a plain number"]
         raise ValueError(f"'{text}' has the unknown unit '{given}'; expected {', '.join(known)}")
-    kind, size = UNITS[given]
+    kind, size = UNITS.get(given, (given, 1.0))
     if kind != wanted:
         usual = " or ".join(_WRITTEN.get(wanted, ()))
         units = f" in {usual}" if usual else f", such as {match[1]} {unit}"

@@ -91,7 +91,7 @@ class Refine(Stage):
         300, "smallest mean size of a superpixel; a small image gets fewer superpixels", unit="px", low=1
     )
     surface_size: int = parameter(16, "superpixels in a surface, to which planes are fitted too; 0: none", low=0)
-    hypotheses: int = parameter(16, "planes tried in each segment", low=1)
+    hypotheses: int = parameter(16, "planes tried in each segment", low=1, high=10_000)
     plane_weight: float = parameter(0.5, "weight of the plane against a match near it", low=0, high=1)
     plane_fill: bool = parameter(True, "whether an accepted plane also fills the holes of its segment")
     fill: bool = parameter(True, "whether the remaining holes are filled from the background")

@@ -321,6 +321,16 @@ def test_numbers_are_written_in_the_unit_that_a_user_would_choose(value, unit, t
     assert quantity(text, unit) == pytest.approx(value)
 
 
+def test_a_unit_that_only_one_parameter_has_may_be_written():
+    nodes = {node.name: node.actor for node in load("rover", ["disparity/full.max_memory=300 MB"]).nodes}
+    assert nodes["disparity/full"].max_memory == 300
+
+
+def test_a_text_in_place_of_a_list_of_changes_is_refused():
+    with pytest.raises(UsageError, match=r"the overrides must be a list of texts, such as \['disparities=64'\]"):
+        load("rover", "disparities=64")
+
+
 def test_a_pipeline_that_is_not_there_may_be_given_as_a_path(tmp_path):
     with pytest.raises(UsageError, match=r"no pipeline '.*a.yaml': neither a file nor one of"):
         load(tmp_path / "a.yaml")

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from recordings import McapSink, McapSource
 from stages import CameraModel, ElevationMap, Mount, NavigationMap, Pose, StereoFrame, Tilt, Transform
 from stages.data import VoxelMap
 from stages.data.arrays import rows_of
@@ -127,6 +128,9 @@ REFUSALS = [
      lambda shape: ElevationMap(0, {"elevation": np.zeros(shape, F32)}, 0.05, (0.0, 0.0), "level")),
     ("left is uint8, right is uint16", [np.uint16],
      lambda kind: StereoFrame(0, FRAME.left, FRAME.right.astype(kind), CAMERA)),
+    ("McapSink.also must be a tuple of texts, not", ["pose", 5, None], lambda bad: McapSink(also=bad)),
+    ("McapSink.viewers must be true or false, not", ["no", 1], lambda bad: McapSink(viewers=bad)),
+    ("McapSource.left must be a text, not 5", [5], lambda bad: McapSource(left=bad)),
     ("Free.length must be a finite number in m, not", WILD, lambda value: Free(length=value)),
     ("Match.p2 must be a finite number, not", WILD, lambda value: Match(p2=value)),
 ]  # fmt: skip
