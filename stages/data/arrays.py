@@ -15,7 +15,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from flow.contracts import StageError
+from flow.contracts import StageError, unaliased
 
 Array = NDArray[Any]
 Span = tuple[slice, slice]  # rows and columns
@@ -73,7 +73,7 @@ def publish_plain(owner: Any) -> None:
 def _kinds(owner: type) -> dict[str, tuple[str, tuple[Any, ...]]]:
     """The type of each field of a data type by name, and what it may be; also for a class made from a data type."""
     base, found = next(own for own in reversed(owner.__mro__) if is_dataclass(own)), {}
-    hints = get_type_hints(base)
+    hints = {name: unaliased(hint) for name, hint in get_type_hints(base).items()}
     for name in (known.name for known in fields(base) if known.init):
         parts = get_args(hints[name]) if isinstance(hints[name], UnionType) else (hints[name],)
         kind, *others = (get_origin(part) or part for part in parts)
