@@ -92,8 +92,8 @@ def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.Sa
         return Value([_located(item, at, loader) for item in node.value], place)
     kind, text = node.tag.rpartition(":")[2], node.value
     if (kind == "int" and re.match(r"[-+]?0[\d_bx]", text)) or (kind in ("int", "float") and ":" in text):
-        other = "octal, hexadecimal, binary or of base 60"
-        raise place.error(f"YAML reads {reprlib.repr(text)} as {other}; write a decimal number without leading zeros")
+        other = "an octal, hexadecimal, binary or base-60 number"
+        raise place.error(f"YAML reads {reprlib.repr(text)} as {other}; write a decimal one without leading zeros")
     try:
         return Value(loader.construct_object(node), place)
     except (AttributeError, LookupError, ValueError) as error:  # in the form of a type, but no such value
