@@ -14,7 +14,8 @@ import numpy as np
 
 from stages.compiled.hamming import clear_partners
 from stages.data import Array, Disparity, PixelOrigin, StereoCamera, StereoFrame
-from stages.matching.intensity import eight_bit, gray
+from stages.matching.intensity import gray_pair
+from stages.orb import orb_features
 from stages.robust_weights import tukey_weights
 
 MIN_FEATURES = 40  # that agree on a motion
@@ -63,19 +64,13 @@ class Step:
 
 def vo_frame(frame: StereoFrame, disparity: Disparity) -> VoFrame:
     """The features of the left image, with the points of those that have a disparity."""
-    image = gray(eight_bit(frame.left)[0])
+    image = frame.once(gray_pair)[0]
     shrink = max(1, round(image.shape[1] / DETECTION_WIDTH))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else image
-    empty = VoFrame(image, np.empty((0, 2), np.float32), np.empty((0, 32), np.uint8), np.empty((0, 3)), frame.camera)
-    if min(small.shape) < PATCH:  # no patch fits; OpenCV's detector fails on images of 1 px
-        return empty
-    found, descriptors = cv2.ORB.create(MAX_FEATURES, scaleFactor=1.3, nlevels=5, fastThreshold=5).detectAndCompute(
-        small, None
-    )
-    if not found:
-        return empty
-    pixels = (np.asarray(cv2.KeyPoint.convert(found)) + 0.5) * shrink - 0.5
-    return VoFrame(image, pixels, descriptors, _triangulated(pixels, disparity, frame.camera), frame.camera)
+    pixels, descriptors = orb_features(small, MAX_FEATURES, scale=1.3, levels=5)
+    pixels = (pixels + 0.5) * shrink - 0.5
+    points = _triangulated(pixels, disparity, frame.camera) if len(pixels) else np.empty((0, 3))
+    return VoFrame(image, pixels, descriptors, points, frame.camera)
 
 
 def _triangulated(pixels: Array, disparity: Disparity, camera: StereoCamera) -> Array:

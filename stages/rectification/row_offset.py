@@ -19,12 +19,10 @@ import numpy as np
 
 from stages.compiled.hamming import clear_partners
 from stages.data import Array
+from stages.orb import orb_features
 from stages.robust_weights import MAD_TO_SIGMA, tukey_weights
 
 MAX_ORB_FEATURES = 4000  # per image
-MIN_SHARE_OF_FEATURES = 0.95  # of them, for a threshold to do
-FAST_THRESHOLDS = 20, 5  # gray levels; the lower one only where the higher one leaves too few features
-MIN_SIDE = 32  # px, smallest side of an image with features
 MAX_HAMMING_BITS = 64  # largest Hamming distance of a pair, of 256 bits
 MAX_DISTANCE_RATIO = 0.8  # largest ratio of the distance to that of the next best (Lowe, 2004)
 MAX_OFFSET = 48.0  # px, largest offset that is searched
@@ -198,26 +196,14 @@ def _offsets(left: Array, right: Array, here: Array, there: Array) -> tuple[Arra
 
 def _paired_features(left: Array, right: Array) -> tuple[Array, Array]:
     """Features of both images with an unambiguous partner, (N, 2) float32 px each."""
-    if min(left.shape) < MIN_SIDE:
-        return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    (points, codes), (partners, partner_codes) = _orb_features(left), _orb_features(right)
-    if len(points) < 2 or len(partners) < 2:
-        return np.empty((0, 2), np.float32), np.empty((0, 2), np.float32)
-    left_places, right_places = (np.asarray(cv2.KeyPoint.convert(found)) for found in (points, partners))
+    # Coarse scales place a feature within a pixel or two.
+    (places, codes), (partners, partner_codes) = (
+        orb_features(image, MAX_ORB_FEATURES, scale=1.5, levels=3) for image in (left, right)
+    )
     chosen, matched = clear_partners(codes, partner_codes, MAX_HAMMING_BITS, MAX_DISTANCE_RATIO)
-    here, there = left_places[chosen], right_places[matched]
+    here, there = places[chosen], partners[matched]
     within = np.abs(here[:, 1] - there[:, 1]) <= MAX_OFFSET
     return here[within], there[within]
-
-
-def _orb_features(image: Array) -> tuple[Sequence[cv2.KeyPoint], Array]:
-    """The strongest features and their codes, of fine scales: coarse ones place a feature within a pixel or two."""
-    points: Sequence[cv2.KeyPoint] = ()
-    for threshold in FAST_THRESHOLDS:
-        if len(points) < MIN_SHARE_OF_FEATURES * MAX_ORB_FEATURES:
-            detector = cv2.ORB.create(MAX_ORB_FEATURES, scaleFactor=1.5, nlevels=3, fastThreshold=threshold)
-            points = detector.detect(image, None)
-    return detector.compute(image, points)
 
 
 def _tracked(image: Array, other: Array, points: Array, guesses: Array) -> tuple[Array, Array]:
