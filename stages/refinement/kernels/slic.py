@@ -2,8 +2,8 @@
 
 Each pixel is compared with the nine centres around its grid cell. The centres of a grid row are expanded to rows of
 pixels once, so that the inner loop runs over whole image rows without a branch. The centres move at half resolution,
-for a quarter of the work; the last assignment uses the full image. Connected components are found by runs of pixels in
-a row, not pixel by pixel.
+for a quarter of the work; the last assignment uses the full image. A wide image is halved before: planes need no finer
+edges. Connected components are found by runs of pixels in a row, not pixel by pixel.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ NO_CENTRE = F32(1e30)
 ITERATIONS = 2  # of the centres, before the last assignment
 TILE = 64  # pixels of a row whose nearest centres are found together
 MIN_HALVED_CELL = 8  # px; with smaller grid cells the centres move at full resolution
+MIN_HALVED_WIDTH = 960  # px; superpixels of a wider image have edges of 2 px
 
 
 def superpixels(image: Array, count: int, threads: int = 1) -> tuple[Array, int]:
@@ -39,20 +40,24 @@ def superpixels(image: Array, count: int, threads: int = 1) -> tuple[Array, int]
     count = min(count, height * width)
     step = math.sqrt(height * width / count)
     grid = max(1, round(height / step)), max(1, round(width / step))
-    min_size = int(0.25 * height * width / count)
-    both = shared_by(threads)
+    roomy = min(height // grid[0], width // grid[1]) >= MIN_HALVED_CELL and min(height, width) > 1
+    small = halved(image[: height // 2 * 2, : width // 2 * 2]) if roomy else image
+    if roomy and width >= MIN_HALVED_WIDTH:
+        labels, total = superpixels(small, count, threads)
+        labels = labels.repeat(2, axis=1).repeat(2, axis=0)
+        odd = (0, height % 2), (0, width % 2)
+        return (np.pad(labels, odd, mode="edge") if labels.shape != (height, width) else labels), total
+    both, colour = shared_by(threads), _colours(image)
+    small = _colours(small) if roomy else colour
+    centres = _grid_centres(small, *grid)
+    for _ in range(ITERATIONS):
+        _move_centres(small, centres, grid, COMPACTNESS / step * (2 if roomy else 1), both)
+    if roomy:
+        centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
+    labels = _labels(colour, centres, grid, COMPACTNESS / step, both)
     with _workspaces.one() as space:
         space.reserve(12 * height * width + 64)
-        colour = _colours(image)
-        scale = 2 if min(height // grid[0], width // grid[1]) >= MIN_HALVED_CELL and min(height, width) > 1 else 1
-        small = colour if scale == 1 else _colours(halved(image[: height // 2 * 2, : width // 2 * 2]))
-        centres = _grid_centres(small, *grid)
-        for _ in range(ITERATIONS):
-            _move_centres(small, centres, grid, COMPACTNESS / step * scale, both)
-        if scale == 2:
-            centres[:, 3:] = centres[:, 3:] * 2 + F32(0.5)
-        labels = _labels(colour, centres, grid, COMPACTNESS / step, both)
-        total = int(connect(labels, min_size, space.array((3, height * width), np.int32)))
+        total = int(connect(labels, int(0.25 * height * width / count), space.array((3, height * width), np.int32)))
     return labels, total
 
 

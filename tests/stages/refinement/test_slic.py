@@ -1,5 +1,6 @@
 """Superpixels: connected, deterministic, and as good as scikit-image's at explaining the image."""
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -8,6 +9,7 @@ from scipy import ndimage
 from skimage import data, measure, segmentation
 
 from stages.compiled.parallel import in_turn
+from stages.matching.kernels.resample import halved
 from stages.refinement.kernels import slic
 
 
@@ -36,6 +38,15 @@ def test_explains_the_image_as_well_as_scikit_image(photo):
     assert explained_variance(photo, ours) > explained_variance(photo, theirs) - 0.01
     assert boundary_recall(photo, ours) > boundary_recall(photo, theirs) - 0.02
     assert 480 <= count <= 720
+
+
+def test_superpixels_of_a_wide_image_are_those_of_its_half(photo):
+    width = slic.MIN_HALVED_WIDTH + 1
+    wide = cv2.resize(photo, (width, 301))
+    labels, count = slic.superpixels(wide, 900)
+    expected, total = slic.superpixels(halved(wide[:300, : width - 1]), 900)
+    assert count == total
+    assert np.array_equal(labels, np.pad(expected.repeat(2, axis=0).repeat(2, axis=1), ((0, 1), (0, 1)), mode="edge"))
 
 
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(1, 4), st.integers(0, 8), st.integers(0, 2**31))
