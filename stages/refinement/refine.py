@@ -23,7 +23,7 @@ from stages.refinement.kernels.depth_edges import sharpen_edges
 from stages.refinement.kernels.holes import KEPT, OCCLUSION, fill_holes
 from stages.refinement.kernels.label_origin import Trust, label_origin
 from stages.refinement.kernels.plane_apply import near_median, pull_to_planes, trusted_matches
-from stages.refinement.kernels.plane_fit import Planes, fit_planes
+from stages.refinement.kernels.plane_fit import fit_planes
 from stages.refinement.kernels.region_merging import merge_regions
 from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
@@ -36,6 +36,7 @@ SATURATION_LEVEL = 250  # 8-bit level from which an even patch is saturated, a s
 MAX_CORRECTION = 1.0  # px; a match farther from its median or plane stays as it is
 MIN_INLIER_SHARE, MIN_VALID_SHARE = 0.8, 0.6  # of a superpixel with an accepted plane; a surface needs half the matches
 MAX_GRADIENT = 0.5  # px/px, of an accepted plane
+MIN_SPARSE_SIZE = 64  # px; planes of segments of this mean size are fitted to a quarter of the pixels
 MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
 MAX_FILL_DISTANCE = 64.0  # px to a disparity that fills a hole; of an occlusion any distance
 MAX_EXTRAPOLATION = 16  # px that holes are filled beyond the last match, at the border or towards the sky
@@ -173,39 +174,36 @@ class Refine(Stage):
             return pixels, None, np.zeros(pixels.shape, bool)
         aimed = max(1, min(self.superpixels, pixels.size // self.min_superpixel_size))
         labels, count = superpixels(image, aimed, self.threads)
-        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
-        accepted = self._accepted(planes, MIN_VALID_SHARE)
+        accepted = self._planes(pixels, weights, labels, count, MIN_VALID_SHARE, seed)
         pixels, agreed = self._pulled(pixels, accepted, labels, within, MAX_CORRECTION)
         if not self.surface_size:
             return pixels, labels, agreed
-        accepted = self._planes_of_regions(pixels, weights, image, labels, count, seed + 1)
-        pixels, again = self._pulled(pixels, accepted, labels, within, MAX_CORRECTION / 2)
+        # A region of superpixels is less likely to be flat, so it moves matches half as far, and it is larger, so it
+        # needs half the share of matches.
+        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size))
+        accepted = self._planes(pixels, weights, group.take(labels), groups, MIN_VALID_SHARE / 2, seed + 1)
+        pixels, again = self._pulled(pixels, accepted[group], labels, within, MAX_CORRECTION / 2)
         return pixels, labels, agreed | again
 
-    def _planes_of_regions(
-        self, pixels: Array, weights: Array, image: Array, labels: Array, count: int, seed: int
+    def _planes(
+        self, pixels: Array, weights: Array, labels: Array, count: int, min_valid_share: float, seed: int
     ) -> Array:
-        """The accepted plane (count, 3) of each superpixel's region, NaN for the others.
+        """The coefficients (count, 3) of the supported planes of segments, NaN for the others.
 
-        A region is less likely to be flat, so it moves matches half as far, and it is larger, so it needs half the
-        share of matches. Every other pixel of every other row is enough; their slopes are twice those of pixels.
+        Every other pixel of every other row is enough, except for small segments.
         """
-        group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size))
-        few = np.s_[::2, ::2]
-        sparse, regions, sparse_weights = (layer[few].copy() for layer in (pixels, labels, weights))
-        sparse[sparse_weights == 0] = np.nan  # filled pixels are no evidence for the second planes
-        planes = fit_planes(sparse, group.take(regions), groups, sparse_weights, self.hypotheses, seed, self.threads)
-        return (self._accepted(planes, MIN_VALID_SHARE / 2, 2) * [0.5, 0.5, 1])[group]
+        spacing = 2 if pixels.size >= MIN_SPARSE_SIZE * count else 1
+        pixels, weights, labels = (layer[::spacing, ::spacing].copy() for layer in (pixels, weights, labels))
+        pixels[weights == 0] = np.nan  # filled pixels are no evidence for a plane
+        planes = fit_planes(pixels, labels, count, weights, self.hypotheses, seed, self.threads)
+        accepted = (planes.inlier_share >= MIN_INLIER_SHARE) & (planes.valid_share >= min_valid_share)
+        coefficients = planes.coefficients / [spacing, spacing, 1]
+        accepted &= np.hypot(coefficients[:, 0], coefficients[:, 1]) <= MAX_GRADIENT
+        return np.where(accepted[:, None], coefficients, np.nan)
 
     def _pulled(self, pixels: Array, planes: Array, labels: Array, within: Extent, near: float) -> tuple[Array, Array]:
         weight, fill = self.plane_weight, self.plane_fill
         return pull_to_planes(pixels, planes, labels, within, near, weight, fill, MAX_EXTRAPOLATION)
-
-    def _accepted(self, planes: Planes, valid_share: float, spacing: int = 1) -> Array:
-        """The coefficients (n, 3) of the supported planes, of pixels `spacing` px apart; NaN for the others."""
-        slope = np.hypot(planes.coefficients[:, 0], planes.coefficients[:, 1])
-        supported = (planes.inlier_share >= MIN_INLIER_SHARE) & (planes.valid_share >= valid_share)
-        return np.where((supported & (slope <= MAX_GRADIENT * spacing))[:, None], planes.coefficients, np.nan)
 
     def _filled(self, pixels: Array, within: Extent, image: Array, guide: Array, right: Array) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
