@@ -233,9 +233,7 @@ class _Tally:
             self._leave_out("/nav/disparity", f"{why}: another image, or a wrong calibration")
             return {}
         columns = cropped_columns(frame["/truth/disparity"].max_disparity)
-        occlusion, codes = (
-            _mask(frame.get(f"/truth/{name}")) for name in ("occlusion", "terrain_class")
-        )  # fmt: skip
+        occlusion, codes = (_mask(frame, f"/truth/{name}", true.shape) for name in ("occlusion", "terrain_class"))
         errors = StereoErrors.of(estimate, true, occlusion, columns)
         self.disparity = self.disparity + errors if self.disparity else errors
         if codes is not None:
@@ -325,11 +323,13 @@ class _Tally:
         return found
 
 
-def _mask(message: Any | None) -> Array | None:
-    """The pixels of a mono8 image of the truth; None if the frame has none."""
-    return (
-        None if message is None else np.asarray(message.data).reshape(message.height, message.step)[:, : message.width]
-    )
+def _mask(frame: dict[str, Any], topic: str, shape: tuple[int, ...]) -> Array | None:
+    """The pixels of a mono8 image of the truth; None if the frame has none. Raises ValueError for another shape."""
+    if (image := frame.get(topic)) is None:
+        return None
+    if (image.height, image.width) != shape:
+        raise ValueError(f"{topic} is {image.width}x{image.height}, /truth/disparity is {shape[1]}x{shape[0]}")
+    return np.asarray(image.data).reshape(image.height, image.step)[:, : image.width]
 
 
 def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:

@@ -92,6 +92,9 @@ class LogSettings:
 
     def __post_init__(self) -> None:
         check_parameters(self)
+        for name, kind in (("pitch", AngleField), ("roll", AngleField), ("time_offset", TimeOffsets)):
+            if not isinstance(getattr(self, name), kind | None):
+                raise ValueError(f"McapSource.{name} must be of {kind.__name__}, not {getattr(self, name)!r}")
         object.__setattr__(self, "base_frame", frame_name(self.base_frame))
         if self.upright_frame is not None:
             object.__setattr__(self, "upright_frame", frame_name(self.upright_frame))

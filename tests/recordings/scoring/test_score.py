@@ -358,7 +358,8 @@ def test_padded_rows_of_a_mask_do_not_change_the_score(tmp_path, truth, frames):
 
 
 @pytest.mark.parametrize(("topic", "schema", "edit", "why"), [
-    ("/occlusion", "sensor_msgs/msg/Image", lambda _, image: setattr(image, "height", 1), "cannot reshape"),
+    ("/occlusion", "sensor_msgs/msg/Image", lambda _, image: setattr(image, "height", 1),
+     r"/truth/occlusion is \d+x1, /truth/disparity is \d+x\d+"),
     ("/navigation_map", "nav_msgs/msg/OccupancyGrid", lambda _, grid: setattr(grid.header, "frame_id", "x"), "it is "),
     ("/elevation_map", "grid_map_msgs/msg/GridMap", lambda _, grid: grid.layers.__setitem__(2, "x"), "the truth lacks"),
 ])  # fmt: skip

@@ -43,6 +43,12 @@ def test_an_offset_undoes_a_constant_latency_and_keeps_log_times(sample, tmp_pat
     assert essences(items_of(late, McapSource(time_offset=TimeOffsets(**{stream: -LATE})))) == whole
 
 
+@pytest.mark.parametrize(("name", "value"), [("time_offset", 1.0), ("time_offset", {"right": 5}), ("pitch", "data.1")])
+def test_a_group_of_settings_of_another_type_is_refused(name, value):
+    with pytest.raises(ValueError, match=rf"McapSource\.{name} must be of (TimeOffsets|AngleField), not "):
+        McapSource(**{name: value})
+
+
 def test_messages_without_a_stamp_are_moved_from_their_log_times(sample, tmp_path):
     path = write_sample(tmp_path / "log.mcap", changed(TILT, UNSTAMPED))
     assert essences(items_of(path)) == essences(items_of(sample))
