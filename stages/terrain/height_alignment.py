@@ -14,6 +14,7 @@ from stages.data import Array
 CORRELATION_LENGTH = 0.3  # m, of stereo height errors
 _HUBER, _CAUCHY = 1.345, 2.385  # standard deviations; 95 % as efficient as least squares for normal errors
 _ROUNDS = 8  # of each
+MAX_CELLS = 4000  # in a fit; the errors of neighbours are alike, so more of them add little
 
 
 def fit_plane(
@@ -26,10 +27,12 @@ def fit_plane(
     x, y: (n,) positions, m; off: (n,) height differences, m; variance: (n,) of each, m^2; expected: (3,) prior standard
     deviations of the plane's numbers; resolution: cell size, m.
     """
+    step = -(-len(x) // MAX_CELLS) or 1
+    x, y, off, variance = x[::step], y[::step], off[::step], variance[::step]
     known = np.flatnonzero(expected > 0)
     plane, covariance = np.zeros(3), np.zeros((3, 3))
     design = np.stack([np.ones_like(x), x, y])[known]
-    trust = 1 / (variance * max(1.0, (CORRELATION_LENGTH / resolution) ** 2))
+    trust = 1 / (variance * max(1.0, (CORRELATION_LENGTH / resolution) ** 2 / step))
     normal = prior = np.diag(1 / expected[known] ** 2)
     sigma = np.sqrt(variance)
     for number in range(2 * _ROUNDS if len(x) else 0):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from stages.terrain import height_alignment
 from stages.terrain.height_alignment import fit_plane
 
 EXPECTED = np.array([0.05, 0.005, 0.005])
@@ -20,6 +21,16 @@ def test_a_plane_is_found_although_a_fifth_of_the_ground_has_changed():
     off[x > 6.5] -= 0.3
     found, _ = fit_plane(x, y, off, np.full(len(x), 1e-4), EXPECTED, 0.05)
     np.testing.assert_allclose(np.column_stack([np.ones_like(x), x, y]) @ (found - plane), 0, atol=0.012)
+
+
+def test_of_many_cells_a_few_thousand_give_the_same_plane_and_covariance(monkeypatch):
+    x, y, off = differences(np.array([0.02, 0.006, -0.004]), count=30_001)
+    given = x, y, off, np.full(len(x), 1e-4), EXPECTED, 0.05
+    found, covariance = fit_plane(*given)
+    monkeypatch.setattr(height_alignment, "MAX_CELLS", len(x))
+    whole, expected = fit_plane(*given)
+    np.testing.assert_allclose(np.column_stack([np.ones_like(x), x, y]) @ (found - whole), 0, atol=0.001)
+    np.testing.assert_allclose(covariance, expected, rtol=0.1, atol=1e-8)
 
 
 def test_without_an_overlap_there_is_no_plane():
