@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stages.compiled.hamming import BYTES
 from stages.data import Array
 
-BYTES = 32  # of a descriptor
 MIN_SIDE = 32  # px, of an image with features; OpenCV's detector fails on images of 1 px
 FAST_THRESHOLDS = 20, 5  # gray levels; the lower one only where the higher one leaves too few features
 MIN_SHARE = 0.95  # of the wanted features, for a threshold to do

@@ -43,6 +43,17 @@ def test_planes_of_regions_fill_superpixels_without_matches():
     assert np.abs(wide.pixels - truth)[hole].max() < 0.05
 
 
+def test_small_superpixels_have_planes_of_all_their_pixels():
+    pixels = flat() + 0.03 * np.arange(WIDTH)
+    holes = np.s_[2::7, 3::7]
+    truth, pixels[holes] = pixels[holes].copy(), np.nan
+    count = pixels.size // 9
+    filled = Refine(superpixels=count, min_superpixel_size=1, surface_size=0, fill=False)(GRAY, matched(pixels))
+    known = np.isfinite(filled.pixels[holes])
+    assert known.mean() > 0.5
+    assert np.abs(filled.pixels[holes] - truth)[known].max() < 0.05
+
+
 # A superpixel with a hole then gets no plane; a region gets one if half of it is matched.
 SURFACES_ONLY = {"superpixels": 1, "min_superpixel_size": 1, "surface_size": 1}
 PLANES_ALONE = {"median_size": 0, "bilateral_radius": 0, "edge_radius": 0, "support": False}
