@@ -107,14 +107,15 @@ class Db3File(Container):
 
     def _read_columns(self) -> tuple[NDArray[np.int64], ...]:
         """Row, channel and log time, ns, of every message, in the order of recording."""
-        columns = array("q"), array("q"), array("q")
+        columns, damage = (array("q"), array("q"), array("q")), ""
         try:
             with suppress(sqlite3.Error):
-                self._read_rows(columns, _ROWS_AT_ONCE)
-            self._read_rows(columns, 1)  # what an error cut off
+                damage = self._read_rows(columns, _ROWS_AT_ONCE)
+            damage = self._read_rows(columns, 1) or damage  # what an error cut off
         except sqlite3.Error as error:
-            held = counted(len(columns[0]), "message")
-            reason = f"the file is truncated or damaged ({sentence_of(error)}); intact before it: {held}"
+            damage = sentence_of(error)
+        if damage:
+            reason = f"the file is truncated or damaged ({damage}); intact: {counted(len(columns[0]), 'message')}"
             self.lost.append(LostMessage(None, max(columns[2], default=0), reason))
         found = tuple(np.frombuffer(column, np.int64) for column in columns)
         for number in sorted(set(found[1].tolist()) - self.channels.keys()):
@@ -123,16 +124,25 @@ class Db3File(Container):
             self.lost.append(LostMessage(None, max(columns[2], default=0), reason))
         return found
 
-    def _read_rows(self, columns: tuple[array[int], ...], at_once: int) -> None:
-        """Add the rows after those in `columns`; an error loses less than `at_once` rows before it."""
+    def _read_rows(self, columns: tuple[array[int], ...], at_once: int) -> str:
+        """Add the rows after those in `columns`; an error loses less than `at_once` rows before it.
+
+        Returns what is wrong with rows that were left out, or an empty text. SQLite reads the missing half of a page as
+        rows of NULL, even where the table forbids it.
+        """
         found = self._database.execute(
             "SELECT rowid, CAST(topic_id AS INTEGER), CAST(timestamp AS INTEGER) FROM messages NOT INDEXED "
-            "WHERE topic_id IS NOT NULL AND timestamp IS NOT NULL AND rowid > ? ORDER BY rowid",
+            "WHERE rowid > ? ORDER BY rowid",
             (columns[0][-1] if columns[0] else -1 << 63,),
         )
+        damage = ""
         while rows := found.fetchmany(at_once):
-            for column, values in zip(columns, zip(*rows, strict=True), strict=True):
-                column.extend(values)
+            if whole := [row for row in rows if None not in row]:
+                for column, values in zip(columns, zip(*whole, strict=True), strict=True):
+                    column.extend(values)
+            if len(whole) < len(rows):
+                damage = "rows without a topic or a time"
+        return damage
 
     def _data_or_reason(self, row: int, size: int) -> memoryview | str:
         """The first `size` bytes of the message in a row, or why it is lost."""

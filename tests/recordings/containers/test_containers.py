@@ -92,6 +92,26 @@ def test_a_cut_database_is_read_as_far_as_it_goes(sample, tmp_path):
     assert lost
 
 
+def test_rows_that_a_damaged_page_has_lost_are_reported(database, sample):
+    with sqlite3.connect(database) as connection:
+        root, page_bytes = connection.execute(
+            "SELECT rootpage, page_size FROM sqlite_master, pragma_page_size() WHERE name = 'messages'"
+        ).fetchone()
+    connection.close()
+    content = bytearray(database.read_bytes())
+
+    def number(at, size):
+        return int.from_bytes(content[at : at + size], "big")
+
+    page = page_bytes * (number(page_bytes * (root - 1) + 8, 4) - 1)  # the last page of rows
+    rows, records = number(page + 3, 2), number(page + 5, 2)
+    content[page + records : page + page_bytes] = bytes(page_bytes - records)
+    database.write_bytes(content)
+    kept = without_types(rows_of(sample))[:-rows]
+    reason = f"the file is truncated or damaged (rows without a topic or a time); intact: {len(kept)} messages"
+    assert read(database) == (kept, [reason])
+
+
 def test_messages_of_an_unknown_topic_and_in_a_journal_are_reported(database):
     edit(database, "UPDATE messages SET topic_id = 99 WHERE id = 3")
     database.with_name(f"{database.name}-wal").write_bytes(b"journal")
@@ -106,7 +126,8 @@ def test_the_advice_for_a_stopped_recorder_adds_its_messages(database, tmp_path,
     path, opened = tmp_path / "stopped.db3", sqlite3.connect(tmp_path / "running.db3", isolation_level=None)
     opened.execute("PRAGMA journal_mode = WAL")
     opened.execute("ATTACH ? AS whole", (str(database),))
-    for (statement,) in opened.execute("SELECT sql FROM whole.sqlite_master WHERE type = 'table'").fetchall():
+    tables = "SELECT sql FROM whole.sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+    for (statement,) in opened.execute(tables).fetchall():
         opened.execute(statement)
     opened.execute("INSERT INTO topics SELECT * FROM whole.topics")
     if not tables_too:
