@@ -69,8 +69,9 @@ def chart(setting: str, values: Sequence[str], figures: Sequence[float]) -> Arra
 def _text(page: Array, text: str, at: tuple[int, int], room: float) -> None:
     """A line of text around half of `at[0]`, smaller where `room` is narrower, px."""
     width = cv2.getTextSize(text, _FONT, _SIZE, 2)[0][0]
-    size = _SIZE * min(1.0, 0.95 * room / max(1, width))
-    cv2.putText(page, text, (round((at[0] - width * size / _SIZE) / 2), at[1]), _FONT, size, INK, 2, cv2.LINE_AA)
+    scale = min(1.0, 0.95 * room / max(1, width))
+    start, thickness = (round((at[0] - scale * width) / 2), at[1]), max(1, round(2 * scale))
+    cv2.putText(page, text, start, _FONT, _SIZE * scale, INK, thickness, cv2.LINE_AA)
 
 
 def changed(found: Diff) -> dict[str, float]:
