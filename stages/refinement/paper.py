@@ -126,7 +126,7 @@ class RefinePaper(Stage):
     def _bilateral(self, pixels: Array, guide: Array) -> Array:
         if self.bilateral_radius == 0:
             return pixels
-        return joint_bilateral(pixels, guide, self.bilateral_radius, every=True)
+        return joint_bilateral(pixels, guide, self.bilateral_radius, plain=True)
 
     def _median(self, pixels: Array) -> Array:
         return near_median(pixels, self.median_size, UNLIMITED) if self.median_size else pixels

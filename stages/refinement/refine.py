@@ -16,7 +16,7 @@ from stages.data import Array, Disparity, StereoFrame
 from stages.data.rows import disparity_rows, frame_rows, rows_without_sigma, with_rows
 from stages.matching.image_noise import frame_noise
 from stages.matching.intensity import alike, eight_bit, gray_pair
-from stages.matching.kernels.texture import contrast, slopes
+from stages.matching.kernels.texture import FLOOR, SMOOTH_FLOOR, contrast, slopes
 from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.bridges import bridge_holes
 from stages.refinement.kernels.depth_edges import sharpen_edges
@@ -175,14 +175,14 @@ class Refine(Stage):
         aimed = max(1, min(self.superpixels, pixels.size // self.min_superpixel_size))
         labels, count = superpixels(image, aimed, self.threads)
         accepted = self._planes(pixels, weights, labels, count, MIN_VALID_SHARE, seed)
-        pixels, agreed = self._pulled(pixels, accepted, labels, within, MAX_CORRECTION)
+        pixels, agreed = self._pulled(pixels, accepted, labels, within, MAX_CORRECTION, self.plane_weight)
         if not self.surface_size:
             return pixels, labels, agreed
-        # A region of superpixels is less likely to be flat, so it moves matches half as far, and it is larger, so it
-        # needs half the share of matches.
+        # A region of superpixels is less likely to be flat, so it moves no match, and it is larger, so it needs half
+        # the share of matches.
         group, groups = merge_regions(image, labels, count, max(1, count // self.surface_size))
         accepted = self._planes(pixels, weights, group.take(labels), groups, MIN_VALID_SHARE / 2, seed + 1)
-        pixels, again = self._pulled(pixels, accepted[group], labels, within, MAX_CORRECTION / 2)
+        pixels, again = self._pulled(pixels, accepted[group], labels, within, MAX_CORRECTION / 2, 0)
         return pixels, labels, agreed | again
 
     def _planes(
@@ -201,9 +201,10 @@ class Refine(Stage):
         accepted &= np.hypot(coefficients[:, 0], coefficients[:, 1]) <= MAX_GRADIENT
         return np.where(accepted[:, None], coefficients, np.nan)
 
-    def _pulled(self, pixels: Array, planes: Array, labels: Array, within: Extent, near: float) -> tuple[Array, Array]:
-        weight, fill = self.plane_weight, self.plane_fill
-        return pull_to_planes(pixels, planes, labels, within, near, weight, fill, MAX_EXTRAPOLATION)
+    def _pulled(
+        self, pixels: Array, planes: Array, labels: Array, within: Extent, near: float, weight: float
+    ) -> tuple[Array, Array]:
+        return pull_to_planes(pixels, planes, labels, within, near, weight, self.plane_fill, MAX_EXTRAPOLATION)
 
     def _filled(self, pixels: Array, within: Extent, image: Array, guide: Array, right: Array) -> tuple[Array, Array]:
         """The remaining holes filled as far as evidence reaches, (H, W) float32, and their kinds of `holes`."""
@@ -222,7 +223,8 @@ class Refine(Stage):
         if not self.support:
             return pixels, np.zeros(pixels.shape, np.float32), np.ones(pixels.shape, bool)
         guide, both, noise = frame.once(gray_pair)[0], frame.once(slopes), frame.once(frame_noise)
-        found = supported(pixels, guessed, guide, both, noise, self.threads)
+        floor = SMOOTH_FLOOR if self.bilateral_radius else FLOOR
+        found = supported(pixels, guessed, guide, both, noise, floor, self.threads)
         consistent = found.sigma <= F32(self.max_sigma)
         if self.min_correlation:
             consistent &= found.correlation >= F32(self.min_correlation)

@@ -27,9 +27,9 @@ TEXTURE_PIXELS = 81  # whose gradients bound the error of a match
 MIN_TEXTURE = 3.0  # information of three blocks in a row, 1/px^2, that noise alone hardly has
 SKY_REACH, MAX_DEVIATIONS = 12, 3.0  # px below the first texture, and standard deviations of the noise, of sky
 MIN_INFORMATION = 1e-3  # of a pixel, 1/px^2
-# Standard deviation of a match whose bound is s: FLOOR and CEILING s^2 / (s^2 + HALF^2), added in squares. Measured on
-# ground away from depth edges.
-FLOOR, CEILING, HALF = 0.05, 1.0, 0.42  # px
+# Standard deviation of a match whose bound is s: FLOOR and CEILING s^2 / (s^2 + HALF^2), added in squares; after a
+# filter that averages matches, SMOOTH_FLOOR instead of FLOOR. Measured on ground away from depth edges.
+FLOOR, SMOOTH_FLOOR, CEILING, HALF = 0.05, 0.03, 1.0, 0.42  # px
 DETAIL_SCALE, RADIUS = 1.0, 3  # px: standard deviation and radius of the Gaussian that separates detail from the rest
 WEIGHTS = cv2.getGaussianKernel(2 * RADIUS + 1, DETAIL_SCALE)[RADIUS:, 0]  # of that Gaussian, from its middle on
 REACH = 2  # px, radius of the neighbourhood over which the power of the detail is measured
@@ -108,11 +108,11 @@ def information(image: Array, slopes: Array, noise: Array, threads: int = 1) -> 
     return layers
 
 
-def match_variance(found: Array) -> Array:
+def match_variance(found: Array, floor: float = FLOOR) -> Array:
     """Expected variance of a match in each block, px^2, (rows, cols) float32; found: their `information`."""
     total, area = (summed(layer) for layer in found)
     bound = 1 / (TEXTURE_PIXELS * np.maximum(total / area, F32(MIN_INFORMATION)))
-    return np.asarray(F32(FLOOR**2) + (F32(CEILING) * bound / (bound + F32(HALF**2))) ** 2)
+    return np.asarray(F32(floor**2) + (F32(CEILING) * bound / (bound + F32(HALF**2))) ** 2)
 
 
 def sky_end(found: Array, image: Array, noise: Array) -> Array:

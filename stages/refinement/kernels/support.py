@@ -48,8 +48,8 @@ F32 = np.float32
 LEVELS = 3  # sizes of blocks: 4, 8 and 16 px; their windows are 20, 40 and 80 px wide
 CORRELATED = 100.0  # px, the area over which the errors of matches are alike
 EXCESS, EXACT = 1.95, 0.001  # of the errors over the bound; px^2, a variance at which half of its square is left
-SYSTEMATIC = 0.03  # px, of what no averaging removes
-BEND_REACH, MIN_BEND, MAX_BEND = 5, 0.06, 0.47  # px; an error is about as large as a bend is over the least one
+SYSTEMATIC = 0.015  # px, of what no averaging removes
+BEND_REACH, MIN_BEND, MAX_BEND = 5, 0.01, 0.42  # px; an error is about as large as a bend is over the least one
 PIXEL_SIGMAS, PIXEL_DEVIATION = 10.0, 0.1  # a match farther off the plane than both together is of another surface
 MIN_BACKING = 4  # matches in the block of a guessed pixel that is supported
 MIDDLE = 0.5 * (BLOCK - 1)  # of a block, from its first pixel
@@ -76,18 +76,24 @@ class Support(NamedTuple):
 
 
 def supported(
-    pixels: Array, guessed: Array, left: Array, slopes: tuple[Array, Array], noise: Array, threads: int = 1
+    pixels: Array,
+    guessed: Array,
+    left: Array,
+    slopes: tuple[Array, Array],
+    noise: Array,
+    floor: float,
+    threads: int = 1,
 ) -> Support:
     """Disparities with as much support as their texture asks for.
 
     pixels: (H, W) float32, px, NaN = unknown; guessed: (H, W) bool, pixels that are no evidence; left: (H, W) uint8;
     slopes: `texture.gradient` of left and right image; noise: (256,) float32, standard deviation of a pixel at each
-    gray level.
+    gray level; floor: px, standard deviation of a match of the best texture.
     """
     both = shared_by(threads)
     noise = stereo_noise(np.where(guessed, F32(np.nan), pixels), left, slopes, noise, threads)
     texture = information(left, slopes[0], noise, threads)
-    variance, first_row = match_variance(texture), sky_end(texture, left, noise)
+    variance, first_row = match_variance(texture, floor), sky_end(texture, left, noise)
     blocks = block_sums(pixels, guessed, left, slopes, information_scale(noise), LEVELS, both)
     blocks[VARIANCE, : variance.shape[0], : variance.shape[1]] = variance
     alike, matches = _correlated(blocks), blocks[N]

@@ -23,7 +23,7 @@ class VarianceModel(NamedTuple):
     """What the variance of a cell depends on, fitted to simulated ground."""
 
     correlated_points: float = 4.0  # neighbouring points that share one matching error
-    systematic_share: float = 0.8  # of the points' variance, which no averaging removes
+    systematic_share: float = 0.7  # of the points' variance, which no averaging removes
     scatter_share: float = 0.2  # of the scatter beyond slope and noise
     curvature_share: float = 0.34  # of the squared curvature
     rim_share: float = 0.15  # of the squared rise, in a cell beside a hole

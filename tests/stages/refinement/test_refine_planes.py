@@ -73,13 +73,13 @@ def test_a_plane_counts_matches_by_their_confidence(surface_size, min_valid, mon
     assert filled.pixels[hole] == pytest.approx(mean, abs=0.01)
 
 
-def test_a_region_pulls_half_as_far_and_agreement_adds_confidence(monkeypatch):
+def test_a_region_moves_no_match_and_agreement_adds_confidence(monkeypatch):
     monkeypatch.setattr(module, "MIN_VALID_SHARE", 1.0)
     pixels = flat()
     pixels[60, 80], pixels[60, 90], pixels[30, 30] = 8.4, 8.7, np.nan
     drawn = Refine(plane_weight=1, **PLANES_ALONE, **SURFACES_ONLY)(GRAY, matched(pixels))
-    assert drawn.pixels[60, 80] == pytest.approx(8, abs=0.01)
-    assert drawn.pixels[60, 90] == np.float32(8.7)
+    assert drawn.pixels[30, 30] == pytest.approx(8, abs=0.01)
+    assert (drawn.pixels[60, 80], drawn.pixels[60, 90]) == (np.float32(8.4), np.float32(8.7))
     assert drawn.confidence[60, 70] > drawn.confidence[60, 90] > 0.9
     assert (drawn.source[60, 70], drawn.source[60, 90]) == (PixelOrigin.MEASURED, PixelOrigin.MEASURED)
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from stages.compiled.parallel import shared_by
 from stages.matching.image_noise import noise_levels
-from stages.matching.kernels.texture import gradient, information_scale
+from stages.matching.kernels.texture import FLOOR, gradient, information_scale
 from stages.refinement.kernels import blocks as kernel
 from stages.refinement.kernels.support import _add_bend, _blend, add_bend_reference, blend_reference, supported
 
@@ -29,7 +29,7 @@ def support(matches, images, guessed=False, threads=1):
     """The matches of two images, supported by these."""
     left, right = images
     guessed = np.broadcast_to(guessed, matches.shape).copy()
-    return supported(matches, guessed, left, (gradient(left), gradient(right)), noise_levels(left), threads)
+    return supported(matches, guessed, left, (gradient(left), gradient(right)), noise_levels(left), FLOOR, threads)
 
 
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 2**31), st.sampled_from([1, 2]))
