@@ -16,7 +16,7 @@ from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.ros2.plain import array_of
 from recordings.scoring.result_log import check_profile, facts_of
-from stages.data import Disparity
+from stages.data import Disparity, StereoCamera
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     Yields
     ------
     ResultFrame
-        A log keeps no confidence, sigma and camera of disparities: NaN, None and None. Regional maps come once a step
-        of the rover.
+        A log keeps no confidence and sigma of disparities: NaN and None. The camera's principal points are equal,
+        because disparities in a log include their difference. Regional maps come once a step of the rover.
 
     Raises
     ------
@@ -67,18 +67,22 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     check_profile(path, facts_of(path, "a log that roverflow run wrote"))
     with McapFile(path) as log:
         schemas = {channel.topic: getattr(channel.schema, "name", "") for channel in log.channels.values()}
-    parts = {topic: f"{topic}/{_JOINED[schema][0]}" for topic, schema in schemas.items() if schema in _JOINED}
+    parts = {
+        topic: {f"{topic}/{part}" for part in _PARTS.get(schema, ())} & schemas.keys()
+        for topic, schema in schemas.items()
+    }
+    belonging = set().union(*parts.values())
     known = {
         topic.removeprefix("/nav/"): topic
         for topic, schema in sorted(schemas.items())
-        if topic.startswith("/nav/") and schema in (*_JOINED, *_READERS) and topic not in parts.values()
+        if topic.startswith("/nav/") and schema in _READERS and topic not in belonging
     }
     for name in sorted(set(streams) - known.keys()):
         if other := schemas.get(f"/nav/{name}"):
             raise LogError(f"{path}: stream '{name}' is {other}, which read_result does not read; it reads {_READABLE}")
         raise LogError(f"{path} has no stream '{name}', only {', '.join(known)}")
     chosen = {known[name] for name in streams or known}
-    read = chosen | {parts[topic] for topic in chosen & parts.keys()} & schemas.keys()
+    read = chosen.union(*(parts[topic] for topic in chosen))
     for stamp, group in groupby(iter_decoded(path, sorted(read)), key=lambda item: item[1]):
         messages = {topic: message for topic, _, message in group}
         yield ResultFrame(stamp, dict(_items(messages, chosen, schemas)))
@@ -89,27 +93,27 @@ def _items(
 ) -> Iterator[tuple[str, Any]]:
     """(Stream, item) of the messages of a stamp."""
     for topic in sorted(messages.keys() & set(chosen)):
-        message, name, schema = messages[topic], topic.removeprefix("/nav/"), schemas[topic]
-        if schema in _JOINED:
-            part, read = _JOINED[schema]
-            yield name, read(message, messages.get(f"{topic}/{part}"))
-        else:
-            yield name, _READERS[schema](message)
+        schema = schemas[topic]
+        parts = (messages.get(f"{topic}/{part}") for part in _PARTS.get(schema, ()))
+        yield topic.removeprefix("/nav/"), _READERS[schema](messages[topic], *parts)
 
 
-def _disparity(message: Any, origins: Any) -> Disparity:
+def _disparity(message: Any, origins: Any, info: Any) -> Disparity:
     pixels = ros2.read_disparity(message)
     unstated = np.full(pixels.shape, np.nan, np.float32)
     source = np.isfinite(pixels).astype(np.uint8) if origins is None else np.asarray(origins.data).reshape(pixels.shape)
-    return Disparity(ros2.stamp_of(message.header), pixels, source, unstated)
+    camera = None
+    if info is not None:
+        (fx, _, cx), (_, fy, cy), _ = np.reshape(info.k, (3, 3)).tolist()
+        camera = StereoCamera(fx, fy, cx, cy, message.t, info.width, info.height, frame_id=ros2.frame_of(info))
+    return Disparity(ros2.stamp_of(message.header), pixels, source, unstated, camera=camera)
 
 
-# Schema -> the part of the topic that belongs to its messages, and what reads both
-_JOINED: dict[str, tuple[str, Callable[[Any, Any], Any]]] = {
-    "stereo_msgs/msg/DisparityImage": ("source", _disparity),
-    "nav_msgs/msg/OccupancyGrid": ("reason", ros2.read_occupancy_grid),
-}
-_READERS: dict[str, Callable[[Any], Any]] = {
+# Schema -> the ends of further topics, whose messages its reader gets with the message
+_PARTS = {"stereo_msgs/msg/DisparityImage": ("source", "camera_info"), "nav_msgs/msg/OccupancyGrid": ("reason",)}
+_READERS: dict[str, Callable[..., Any]] = {
+    "stereo_msgs/msg/DisparityImage": _disparity,
+    "nav_msgs/msg/OccupancyGrid": ros2.read_occupancy_grid,
     "grid_map_msgs/msg/GridMap": ros2.read_grid_map,
     "nav_msgs/msg/Odometry": lambda message: ros2.pose_of(message, 0, "base_link"),
     "sensor_msgs/msg/PointCloud2": ros2.read_point_cloud,
@@ -120,4 +124,4 @@ _READERS: dict[str, Callable[[Any], Any]] = {
         ("std_msgs/msg/Float64", "std_msgs/msg/Int64", "std_msgs/msg/Bool", "std_msgs/msg/String"), attrgetter("data")
     ),
 }
-_READABLE = ", ".join(name.rpartition("/")[2] for name in (*_JOINED, *_READERS))
+_READABLE = ", ".join(name.rpartition("/")[2] for name in _READERS)

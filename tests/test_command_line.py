@@ -33,7 +33,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = {
     "/nav/disparity", "/nav/points", "/nav/elevation_map", "/nav/navigation_map", "/nav/pose", "/nav/regional_map",
     "/nav/regional_navigation_map", "/tf", "/nav/diagnostics", "/nav/navigation_map/reason",
-    "/nav/regional_navigation_map/reason", "/nav/disparity/source",
+    "/nav/regional_navigation_map/reason", "/nav/disparity/source", "/nav/disparity/camera_info",
 }  # fmt: skip
 
 

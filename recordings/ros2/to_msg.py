@@ -79,6 +79,20 @@ def camera_info(stamp: int, frame_id: str, model: CameraModel) -> Any:
     )  # fmt: skip
 
 
+def pinhole(width: int, height: int, k: Array) -> CameraModel:
+    """The calibration of a rectified camera without distortion. k: (3, 3) intrinsics, px."""
+    return CameraModel(width, height, k, np.zeros(5), np.eye(3), np.column_stack([k, np.zeros(3)]))
+
+
+def disparity_camera(disparity: Disparity) -> dict[str, Any]:
+    """The sensor_msgs/CameraInfo of the rectified left camera, by the end of its topic; empty where it is unknown."""
+    camera = disparity.camera
+    if camera is None:
+        return {}
+    k = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
+    return {"/camera_info": camera_info(disparity.stamp, camera.frame_id, pinhole(camera.width, camera.height, k))}
+
+
 def disparity_image(disparity: Disparity, step: float = 0.0) -> Any:
     """stereo_msgs/DisparityImage, 32FC1, NaN = unknown.
 

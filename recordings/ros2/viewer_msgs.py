@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from recordings.ros2.to_msg import camera_info, compressed_image, float_cloud, image, transform_message
+from recordings.ros2.to_msg import camera_info, compressed_image, float_cloud, image, pinhole, transform_message
 from stages.data import (
     Array,
     CameraModel,
@@ -79,12 +79,11 @@ def camera_above(navigation: NavigationMap, frame_id: str) -> tuple[Any, Any]:
     near, far = navigation.origin[0], navigation.origin[0] + cols * navigation.resolution
     focal = CAMERA_HEIGHT / navigation.resolution
     k = np.array([[focal, 0.0, (rows - 1) / 2], [0.0, focal, (cols - 1) / 2], [0.0, 0.0, 1.0]])
-    model = CameraModel(rows, cols, k, np.zeros(5), np.eye(3), np.column_stack([k, np.zeros(3)]))
     down = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
     place = np.array([(near + far) / 2, (left + right) / 2, CAMERA_HEIGHT])
     pose = Transform(navigation.frame_id, frame_id, down, place)
     stamp = navigation.stamp
-    return camera_info(stamp, frame_id, model), transform_message([(pose, stamp)])
+    return camera_info(stamp, frame_id, pinhole(rows, cols, k)), transform_message([(pose, stamp)])
 
 
 def terrain_points(terrain: ElevationMap, colors: Array) -> Any:
@@ -107,4 +106,4 @@ def _every_nth(pixels: Array, camera: StereoCamera) -> tuple[Array, CameraModel]
     height, width = thinned.shape[:2]
     k = np.diag([camera.fx / step, camera.fy / step, 1.0])
     k[:2, 2] = (camera.cx - step // 2) / step, (camera.cy - step // 2) / step
-    return thinned, CameraModel(width, height, k, np.zeros(5), np.eye(3), np.column_stack([k, np.zeros(3)]))
+    return thinned, pinhole(width, height, k)

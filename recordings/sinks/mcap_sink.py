@@ -21,6 +21,7 @@ from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
 from recordings.ros2.plain import message_of
 from recordings.ros2.to_msg import (
     diagnostics,
+    disparity_camera,
     disparity_image,
     grid_map,
     occupancy_grid,
@@ -245,7 +246,8 @@ class McapSink:
         """The messages of a value, by the part of their topic below that of the stream."""
         match leaf:
             case Disparity():
-                return {"": disparity_image(leaf, self.disparity_step), "/source": source_image(leaf)}
+                image = disparity_image(leaf, self.disparity_step)
+                return {"": image, "/source": source_image(leaf)} | disparity_camera(leaf)
             case PointCloud():
                 return {"": point_cloud(thinned(leaf, self.point_spacing), self.length_step, self.precision)}
             case ElevationMap():

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from recordings.errors import LogError
+from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
-from stages.data import Disparity, ElevationMap, NavigationMap, PixelOrigin, Pose, known
+from stages import Reproject
+from stages.data import Disparity, ElevationMap, NavigationMap, PixelOrigin, Pose, StereoFrame, known
 from tests.conftest import FRAMES
 
 
@@ -27,8 +29,23 @@ def test_disparities_have_their_origins_and_maps_their_reasons(result):
     np.testing.assert_array_equal(np.isfinite(disparity.pixels), known(disparity.source))
     assert (disparity.source == PixelOrigin.OUT_OF_VIEW).any()
     assert np.isnan(disparity.confidence).all()
-    assert disparity.sigma is disparity.camera is None
+    assert disparity.sigma is None
     assert len(np.unique(navigation.reason)) > 3
+
+
+def test_a_disparity_of_a_log_becomes_points_in_a_notebook(result, traverse):
+    """The points are those of the log's own calibration and disparities."""
+    disparity = next(read_result(result, "disparity")).items["disparity"]
+    _, _, info = next(iter_decoded(traverse, ["/stereo/left/camera_info"]))
+    _, _, logged = next(iter_decoded(result, ["/nav/disparity"]))
+    gray = np.zeros(disparity.pixels.shape, np.uint8)
+    cloud = Reproject()(StereoFrame(disparity.stamp, gray, gray, disparity.camera), disparity)
+    fx, cx, fy, cy = info.p[[0, 2, 5, 6]]
+    row, col = np.divmod(cloud.pixel, gray.shape[1])
+    depth = logged.f * logged.t / disparity.pixels[row, col]
+    exact = np.column_stack([(col - cx) / fx * depth, (row - cy) / fy * depth, depth])
+    np.testing.assert_allclose(cloud.points, exact, rtol=1e-4, atol=1e-5)
+    assert len(row) > gray.size / 3
 
 
 def test_one_stream_may_be_given_by_its_name_alone(result):

@@ -93,8 +93,8 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path):
     read = list(iter_decoded(write(tmp_path / "out.mcap")))
     topics = [(topic, stamp - START) for topic, stamp, _ in read]
     results = [f"/nav/{name}" for name in ("disparity", "points", "elevation_map", "navigation_map")]
-    frame = ["/nav/disparity", "/nav/disparity/source", *results[1:], "/nav/navigation_map/reason", "/tf"]
-    frame.append("/nav/diagnostics")
+    frame = [f"/nav/disparity{end}" for end in ("", "/source", "/camera_info")]
+    frame += [*results[1:], "/nav/navigation_map/reason", "/tf", "/nav/diagnostics"]
     second = [topic for topic in frame if topic != "/nav/elevation_map"]
     assert topics == [(t, 0) for t in frame] + [(t, 100) for t in second] + [("/nav/diagnostics", 100)]
     first = {topic: message for topic, stamp, message in read if stamp == START}
