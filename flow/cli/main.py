@@ -15,7 +15,7 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from flow.cli.commands import demo, export, fleet, graph, info, listing, pipeline, run, score, simulate, stages
-from flow.cli.debugging import attempt, desk, diff, report, why
+from flow.cli.debugging import attempt, desk, diff, report, verify, why
 from flow.cli.importers import images
 from flow.cli.importers.data_sets import DATA_SETS, DataSet
 from flow.cli.replay import product_version
@@ -32,6 +32,7 @@ COMMANDS: dict[str, ModuleType] = {
     "pipeline": pipeline,
     "simulate": simulate,
     "score": score,
+    "verify": verify,
     "diff": diff,
     "try": attempt,
     "why": why,

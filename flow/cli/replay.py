@@ -90,7 +90,6 @@ def _about(
     from recordings.scoring.result_log import names_of
 
     about = {
-        "roverflow": product_version(),
         "pipeline": graph.text,
         "overrides": "\n".join(overrides),
         "log": names_of(logs),
@@ -98,7 +97,7 @@ def _about(
         "start": "" if start is None else repr(float(start)),
         "end": "" if end is None else repr(float(end)),
         "every": "" if every is None else str(every),
-        **{name: version(name) for name in ("numpy", "opencv-python-headless", "numba", "scikit-image")},
+        **versions(),
     }
     # A file name may hold bytes that are not UTF-8.
     return {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
@@ -188,6 +187,12 @@ def _outputs(graph: Graph, paths: Mapping[str, Path | None]) -> dict[str, Path]:
 def as_json(summary: dict[str, Any]) -> dict[str, Any]:
     """The summary of a run without the entry objects for sinks; "ledger" holds them as plain values."""
     return {name: value for name, value in summary.items() if name != "entries"}
+
+
+def versions() -> dict[str, str]:
+    """The versions of what results depend on."""
+    parts = ("numpy", "opencv-python-headless", "numba", "scikit-image")
+    return {"roverflow": product_version(), **{name: version(name) for name in parts}}
 
 
 def product_version() -> str:

@@ -6,8 +6,6 @@ images. The log gets its name when it is complete.
 
 from __future__ import annotations
 
-import hashlib
-from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 from flow.contracts import counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
 from recordings.errors import LogError
+from recordings.mcap.digests import Digests
 from recordings.mcap.file import McapFile
 from recordings.ros2.cdr import LAST_STAMP, standard_types
 
@@ -69,7 +68,7 @@ class Ros2Writer:
         self._schemas: dict[MessageKind, int] = {}
         self._channels: dict[tuple[str, int | None], tuple[int, MessageKind]] = {}
         self._counts: dict[int, int] = {}
-        self._digests: defaultdict[str, Any] | None = defaultdict(hashlib.sha1) if digests else None
+        self._digests = Digests() if digests else None
         self._partial = self._temporary_name()
         with writing(self.path):
             self._file = self._open()
@@ -99,14 +98,14 @@ class Ros2Writer:
             if large:
                 self._writer.flush()
             if self._digests is not None and copy_of is None:
-                self._digests[topic].update(b"%d %d %d " % (stamp, len(data), isal_zlib.crc32(data)))
+                self._digests.add(topic, stamp, data)
             self._writer.add_message(channel, log_time=stamp, publish_time=stamp, data=data, sequence=count)
             if large:
                 self._writer.flush()
 
     def digests(self) -> dict[str, str]:
-        """Topic -> hexadecimal digest of the stamps, lengths and CRC-32 of its messages so far; without copied ones."""
-        return {topic: digest.hexdigest()[:32] for topic, digest in (self._digests or {}).items()}
+        """Topic -> digest of its messages so far, without copied ones."""
+        return self._digests.by_topic() if self._digests is not None else {}
 
     def attachment(self, name: str, media_type: str, content: bytes) -> None:
         """Append a file."""

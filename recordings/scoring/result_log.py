@@ -49,12 +49,15 @@ def check_profile(path: Path, about: Mapping[str, str]) -> None:
         raise LogError(f"{path} has results in Foxglove's messages; run the log again with --profile ros2")
 
 
-def end_of_run(result: Path) -> dict[str, str]:
-    """The pipeline, the verdict, counts and findings of a run; empty if the end of its result log is missing."""
+def end_of_run(result: Path, record: str = "roverflow.run") -> dict[str, str]:
+    """The pipeline, the verdict, counts and findings of a run; empty if the end of its result log is missing.
+
+    record: the metadata record of that end; that of the topics' digests is "roverflow.digests".
+    """
     with suppress(Exception), result.open("rb") as file:  # a cut log fails mcap's reader in any way
-        for record in make_reader(file).iter_metadata():
-            if record.name == "roverflow.run":
-                return dict(record.metadata)
+        for found in make_reader(file).iter_metadata():
+            if found.name == record:
+                return dict(found.metadata)
     return {}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -18,18 +18,27 @@ from flow.runtime.graph import Graph
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
 
+RESULT = "the log that roverflow run wrote"
+
 
 def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = False) -> Graph:
     """The pipeline of a result log as it ran, with what its survey fixed, and then changed. Raises LogError."""
     from recordings.scoring.result_log import facts_of, pipeline_of
 
-    about = facts_of(result, "the log that roverflow run wrote")
-    sys.path.append(str(Path.cwd()))  # so that stages can be in this folder
-    with TemporaryDirectory(prefix="roverflow-why-") as folder:
-        file = Path(folder) / f"{pipeline_of(result)}.yaml"
-        file.write_text(about["pipeline"], encoding="utf-8")
+    about = facts_of(result, RESULT)
+    with pipeline_of_run(about, pipeline_of(result)) as file:
         own = [*about["overrides"].splitlines(), *about.get("fixed", "").splitlines()]
         return load(str(file), [*own, *changes], with_sinks=with_sinks)
+
+
+@contextmanager
+def pipeline_of_run(about: Mapping[str, str], name: str) -> Iterator[Path]:
+    """The pipeline of a run in a temporary file of this name. about: the facts of the run."""
+    sys.path.append(str(Path.cwd()))  # so that stages can be in this folder
+    with TemporaryDirectory(prefix="roverflow-") as folder:
+        file = Path(folder) / f"{name}.yaml"
+        file.write_text(about["pipeline"], encoding="utf-8")
+        yield file
 
 
 def note_damage(result: Path) -> None:

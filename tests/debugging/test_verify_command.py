@@ -1,0 +1,98 @@
+"""`roverflow verify`: a result log is as its run wrote it, and the same run gives it again."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from flow.cli import replay
+from recordings.mcap.writer import MessageKind, Ros2Writer
+from tests.conftest import SMALL, chunks_of, edit_of, mcap_rows, rewrite, roverflow, with_broken
+
+TOPICS = "13 topics"
+
+
+@pytest.fixture(scope="module")
+def short(traverse, tmp_path_factory):
+    """Makes a result of the first frames of the traverse, beside a copy of it."""
+    log = Path(shutil.copy(traverse, tmp_path_factory.mktemp("verify")))
+
+    def make(name, *words):
+        out = log.with_name(name)
+        assert roverflow("run", log, "-p", "fast", *SMALL, "--end", "1.2", "-o", out, "--no-rrd", *words) == 0
+        return out
+
+    return make
+
+
+def edited(result, out, change=lambda topic, data: data, **facts):
+    """A result log with other messages, or with other facts of the end of its run."""
+    with result.open("rb") as file:
+        records = {record.name: record.metadata | facts for record in make_reader(file).iter_metadata()}
+    with Ros2Writer(out) as writer:
+        writer.metadata("roverflow", records.pop("roverflow"))
+        for topic, encoding, schema, stamp, data in mcap_rows(result):
+            writer.add(topic, MessageKind(schema[0], encoding, *schema[1:]), stamp, change(topic, data))
+        for name, values in records.items():
+            writer.metadata(name, values)
+    return out
+
+
+def test_the_same_run_again_gives_the_same_messages(result, traverse, said):
+    """Also without the recording that the first run wrote."""
+    lines = said(0, "verify", result, "--log", traverse, "--workers", 1).out.splitlines()
+    assert lines == [f"{TOPICS} as the run wrote them", f"{TOPICS} the same in a second run of {traverse.name}"]
+
+
+@pytest.mark.parametrize("words", [
+    ["--with-inputs", "--every", "2"],
+    ["--profile", "foxglove", "--start", "0.4", "--every", "0.3m", "--set", "McapSink.point_spacing=0"],
+])  # fmt: skip
+def test_a_second_run_has_the_options_of_the_first(short, said, words):
+    assert said(0, "verify", short("options.mcap", *words)).out.count("topics") == 2
+
+
+def test_a_changed_message_is_found(short, said, tmp_path):
+    result = short("changed.mcap")
+    other = edited(result, tmp_path / "out.mcap", lambda topic, data: data[:-1] + b"?" if "points" in topic else data)
+    first, *_, last = said(3, "verify", other, "--log", result.with_name("traverse.mcap")).out.splitlines()
+    assert first == "changed since its run: /nav/points"
+    assert last == f"{TOPICS} the same in a second run of traverse.mcap"
+
+
+def test_another_input_gives_other_results_and_the_versions_are_named(short, traverse, said, tmp_path, monkeypatch):
+    def darken(index, message):
+        message.data = np.asarray(message.data) // 2
+
+    result = short("out.mcap")
+    other = rewrite(traverse, tmp_path / "dark.mcap", edit_of("left/image_rect_color", "sensor_msgs/msg/Image", darken))
+    monkeypatch.setattr(replay, "version", lambda name: "0.0.0")
+    again = tmp_path / "again.mcap"
+    words = ("verify", result, "--log", other)
+    whole, note, different, versions, remedy = said(3, *words, "-o", again).out.splitlines()
+    assert whole == f"{TOPICS} as the run wrote them"
+    assert note == f"note: {other} has other bytes than the input of {result}, but the same stamps"
+    assert different.startswith("different in a second run: /nav/")
+    assert "/nav/disparity, " in different
+    assert versions.startswith("versions of its run: ")
+    assert f"numpy {np.__version__}, now 0.0.0" in versions
+    assert remedy == f"roverflow diff {result} {again}"
+    said(3, "diff", result, again)
+    assert said(3, *words).out.endswith("-o AGAIN.mcap keeps the second result\n")
+
+
+def test_what_cannot_be_verified_is_refused_in_a_sentence(short, traverse, refused, tmp_path):
+    result = short("out.mcap")
+    assert "is not a result log" in refused("verify", traverse)
+    alone = shutil.copy(result, tmp_path / "alone.mcap")
+    assert "traverse.mcap, is not in its folder; give it with --log" in refused("verify", alone)
+    stopped = edited(result, tmp_path / "stopped.mcap", interrupted="True")
+    assert "was interrupted, so it cannot be repeated; only the file was checked" in refused("verify", stopped)
+    broken = with_broken(result, chunks_of(result)[0][0])
+    assert "is damaged: " in refused("verify", broken)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(result.read_bytes()[:-2000])
+    assert "has no digests of its topics, because its end is missing" in refused("verify", cut)
+    assert "is an input of this command" in refused("verify", result, "-o", result)
