@@ -76,7 +76,7 @@ class FrameRecord:
     entries
         The losses of this frame, and those of the log since the frame before.
     seconds
-        Stage -> wall time; sink -> that of the last frame that was through, with what it prepared.
+        Stage -> wall time; sink -> that of the last frame that was through.
     queues
         Stage -> frames in its inbox when this frame was delivered.
     unchanged
@@ -176,9 +176,6 @@ class Sink(Protocol):
     - `names_streams`, `names_patterns`: the parameters that name streams, and those that name them by patterns such as
       disparity/*, so that a pipeline file can be checked;
     - `unwritable(stream, kind)`: why the sink cannot write a stream, or an empty str; asked when a pipeline is loaded;
-    - `prepare(stream, item)`: what `write` gets in place of an item, such as its encoded bytes. Any thread calls it as
-      soon as the item is there, frames in any order, so it must not depend on other calls. The engine does not keep the
-      item longer for this sink;
     - `asks`: parameter -> value that the run gives to the stages that have the parameter at its default, so that they
       make more for this sink; no other result may change by it;
     - `discard()`: gives up the output and keeps an existing file, where no frame got through or another output failed;

@@ -13,9 +13,6 @@ needed fewer times; the others find other work.
 
 A stage may return None, where nothing is new; then `Unchanged` passes through everything downstream. A stage that can
 `flush` takes a frame when the next one is there, or none will come: so it can flush with the last frame.
-
-A sink may `prepare` items one by one, which any worker does as soon as an item is there. The engine then keeps what it
-returned in place of the item.
 """
 
 from __future__ import annotations
@@ -39,8 +36,7 @@ _NO_ITEM = (Absent, Unchanged)
 @dataclass(eq=False)
 class _Frame:
     """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
-    streams that are there or being made; seconds: of its stages, and of sinks with what they prepare; begun, done: the
-    work on it."""
+    streams that are there or being made; seconds: of its stages and sinks; begun, done: the work on it."""
 
     index: int
     stamp: int
@@ -56,10 +52,9 @@ class _Frame:
 class _Work:
     """A stage, or a sink (`output` is then None).
 
-    inputs: the streams that must be there before it starts; reads: those of them whose items it uses; sink: the name of
-    the sink that it belongs to; large: whether it needs much memory; flushes: whether it must know the last frame;
-    consumers: what waits for its output; inbox: indices of frames; next: the frame that an ordered work takes next;
-    seconds, cpu_seconds: its time so far.
+    inputs: the streams that must be there before it starts; reads: those of them whose items it uses; large: whether it
+    needs much memory; flushes: whether it must know the last frame; consumers: what waits for its output; inbox:
+    indices of frames; next: the frame that an ordered work takes next; seconds, cpu_seconds: its time so far.
     """
 
     name: str
@@ -68,7 +63,6 @@ class _Work:
     output: str | None
     ordered: bool
     run: Callable[[_Frame], Any]
-    sink: str = ""
     large: bool = False
     flushes: bool = False
     seconds: float = 0.0
@@ -109,7 +103,7 @@ class Engine:
         self._sink_seconds = dict.fromkeys(sinks, 0.0)  # of the last frame that was through
         self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
         for name, (sink, streams) in sinks.items():
-            self._work += self._sink_work(name, sink, streams)
+            self._work.append(self._sink_work(name, sink, streams))
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
         self._readers: dict[str, list[_Work]] = {}
@@ -184,19 +178,13 @@ class Engine:
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Stage or sink -> its time so far, s. That of a sink includes what it prepared."""
-        return self._by_name(lambda work: work.seconds)
+        """Stage or sink -> its time so far, s."""
+        return {work.name: work.seconds for work in self._work}
 
     @property
     def cpu_seconds(self) -> dict[str, float]:
         """Stage or sink -> the CPU time of its worker so far, s, without threads that it starts itself."""
-        return self._by_name(lambda work: work.cpu_seconds)
-
-    def _by_name(self, seconds_of: Callable[[_Work], float]) -> dict[str, float]:
-        seconds: dict[str, float] = {}
-        for work in self._work:
-            seconds[work.sink or work.name] = seconds.get(work.sink or work.name, 0.0) + seconds_of(work)
-        return seconds
+        return {work.name: work.cpu_seconds for work in self._work}
 
     def bottleneck(self, cores: int) -> dict[str, Any]:
         """What limits the rate of the run, on this number of cores (`flow.runtime.bottleneck`)."""
@@ -234,8 +222,7 @@ class Engine:
                     self._in_large -= work.large
                     work.seconds += seconds
                     work.cpu_seconds += cpu
-                    name = work.sink or work.name
-                    frame.seconds[name] = frame.seconds.get(name, 0.0) + seconds
+                    frame.seconds[work.name] = seconds
                     retired = self._deliver(work, frame, value)
                 except BaseException as error:  # a worker must not die silently
                     self.failure = self.failure or (work.name, error)
@@ -293,10 +280,10 @@ class Engine:
     def _deliver(self, work: _Work, frame: _Frame, value: Any) -> list[bool]:
         """Store the result of a work; returns for each frame that is now through whether it is complete."""
         if isinstance(value, BaseException):
-            if work.sink:
-                self.failure = self.failure or (work.sink, value)
-            stream, stage = ("frame", work.sink) if work.sink else (work.name, work.name)
-            entry = self._ledger.add(Loss(stream, frame.stamp, stage, LossReason.FAILED, failure(value)))
+            if work.output is None:
+                self.failure = self.failure or (work.name, value)
+            stream = work.output or "frame"
+            entry = self._ledger.add(Loss(stream, frame.stamp, work.name, LossReason.FAILED, failure(value)))
             frame.entries.append(entry)
             value = Absent(entry)
         if work.output:
@@ -363,16 +350,12 @@ class Engine:
         large = bool(getattr(node.actor, "large", False))
         return _Work(node.name, streams, streams, node.name, node.stateful, run, large=large, flushes=flushes)
 
-    def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> list[_Work]:
-        """The work of a sink: what it prepares, and the writing."""
-        stages = [work for work in self._work if not work.sink]
-        prepare = getattr(sink, "prepare", None)
-        given = {stream: stream if prepare is None else f"{name}: {stream}" for stream in streams}  # stream -> its key
-        prepared = [] if prepare is None else [self._preparing(name, prepare, *pair) for pair in given.items()]
+    def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> _Work:
+        stages = [work for work in self._work if work.output]
         order = {work.name: index for index, work in enumerate(self._work)}
 
         def run(frame: _Frame) -> None:
-            values = {stream: frame.values[key] for stream, key in given.items()}
+            values = {stream: frame.values[stream] for stream in streams}
             items = {stream: value for stream, value in values.items() if not isinstance(value, _NO_ITEM)}
             unchanged = frozenset(stream for stream, value in values.items() if isinstance(value, Unchanged))
             entries = tuple(sorted(frame.entries, key=lambda entry: (order.get(entry.stage, -1), entry.stamp)))
@@ -382,13 +365,8 @@ class Engine:
             sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues, unchanged))
 
         # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
-        every = tuple(dict.fromkeys([*given.values(), *(work.name for work in stages)]))
-        return [*prepared, _Work(name, every, tuple(given.values()), None, True, run, sink=name)]
-
-    @staticmethod
-    def _preparing(sink: str, prepare: Callable[[str, Any], Any], stream: str, key: str) -> _Work:
-        """The work that prepares the items of one stream for a sink; it stores them under `key`."""
-        return _Work(key, (stream,), (stream,), key, False, lambda f: prepare(stream, f.values[stream]), sink=sink)
+        every = tuple(dict.fromkeys([*streams, *(work.name for work in stages)]))
+        return _Work(name, every, tuple(streams), None, True, run)
 
 
 def _missing(values: Iterable[Any]) -> Absent | Unchanged | None:
