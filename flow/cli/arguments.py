@@ -56,7 +56,7 @@ def seconds(text: str) -> float:
 
     try:
         value = quantity(text if text[-1:].isalpha() else f"{text} s", "s")
-    except ValueError:
+    except (ValueError, OverflowError):
         value = math.nan
     if not 0 <= value <= MAX_SECONDS:
         raise argparse.ArgumentTypeError(
@@ -87,10 +87,15 @@ def instant(text: str) -> At:
         date, hours, minutes, whole, fraction = found.groups()
         ns = int((fraction or "0").replace(" ", "")[:9].ljust(9, "0"))
         of_day = np.timedelta64(((60 * int(hours) + int(minutes)) * 60 + int(whole)) * 1_000_000_000 + ns, "ns")
+        if date is None:
+            return of_day
         with suppress(ValueError):  # no such date
-            return of_day if date is None else np.datetime64(date, "ns") + of_day
+            if abs(int(np.datetime64(date, "s").astype(int))) < MAX_SECONDS:  # others wrap around in ns
+                return np.datetime64(date, "ns") + of_day
     elif re.fullmatch(r"\d{18,19}|\d{1,19} ?ns", text.strip()):
-        return np.datetime64(int(text.strip().removesuffix("ns")), "ns")
+        ns = int(text.strip().removesuffix("ns"))
+        if ns < MAX_SECONDS * 1e9:
+            return np.datetime64(ns, "ns")
     with suppress(argparse.ArgumentTypeError):
         return seconds(text)
     raise argparse.ArgumentTypeError(

@@ -23,7 +23,8 @@ class TimeRange:
     @classmethod
     def after(cls, first: int, start: float | None, end: float | None) -> TimeRange:
         """The part from `start` to `end`, s after the first message at `first`, ns."""
-        return cls(*(None if seconds is None else first + round(seconds * 1e9) for seconds in (start, end)))
+        low = first + round(start * 1e9) if start else None  # the stamps of the first messages are before `first`
+        return cls(low, None if end is None else first + round(end * 1e9))
 
     @property
     def edges(self) -> list[int]:

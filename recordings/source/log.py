@@ -108,7 +108,7 @@ class McapLog:
         for first in sorted({int((part + 0.5) * len(times) / count) for part in range(count)}) if times else ():
             last = min(first + EXCERPT_FRAMES, len(times)) - 1
             # Stamps precede log times, so begin after the previous image.
-            low = times[first - 1] + 1 if first else self.file.start
+            low = times[first - 1] + 1 if first else None
             part = TimeRange(low, times[last] + MAX_LATENESS_NS)
             yield self._between(part, FramesInRange(part, ()), streams, ahead)
 

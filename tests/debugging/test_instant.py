@@ -2,6 +2,7 @@
 
 import socket
 import time
+from operator import itemgetter
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from flow.cli.debugging.instants import part_of
 from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.errors import UsageError
 from recordings import McapSource
-from tests.conftest import SMALL, roverflow
+from tests.conftest import SMALL, mcap_rows, roverflow, write_mcap
 from tests.recordings.sample_log import LEFT, changed, write_sample
 from tests.viewers import viewer
 
@@ -35,6 +36,22 @@ def test_a_time_as_the_viewer_shows_it_is_that_of_the_frame(traverse, stamps, sh
                 assert [item.stamp for _, stream, item in cut.events(("left",)) if stream == "left"] == [stamp]
 
 
+@pytest.mark.parametrize("delay", [0.02, 0.3, 0.7])
+def test_the_frame_of_a_stamp_is_read_however_late_the_log_has_it(traverse, stamps, tmp_path, delay):
+    def late(row):
+        topic, encoding, schema, log_time, data = row
+        return topic, encoding, schema, log_time + round(delay * 1e9) * ("stereo" in topic), data
+
+    rows = sorted(map(late, mcap_rows(traverse)), key=itemgetter(3))
+    log = write_mcap(tmp_path / "late.mcap", rows)
+    with McapSource().open(log) as opened:
+        for number, stamp in enumerate(stamps):
+            part = part_of(opened, np.datetime64(stamp, "ns"), 1, min(number, 1))
+            opened.narrow(part.start, part.end)
+            read = [item.stamp for _, stream, item in opened.events(("left",)) if stream == "left"]
+            assert read == stamps[max(number - 1, 0) : number + 1]
+
+
 def test_a_time_of_day_is_that_of_stamps_also_where_they_are_of_another_clock(tmp_path):
     with McapSource().open(write_sample(tmp_path / "log.mcap", changed(LEFT, {"header.stamp.sec": 7}))) as log:
         for shown in ("00:00:07.2", "1970-01-01 00:00:07.2", "7200000000 ns", "0.2"):
@@ -42,7 +59,8 @@ def test_a_time_of_day_is_that_of_stamps_also_where_they_are_of_another_clock(tm
 
 
 def test_other_times_are_refused(traverse, tmp_path, capsys, refused):
-    for text in ("yesterday", "2023-13-45 00:00:00", "12:03", "12:75:00", "24:00:00", "-1"):
+    beyond = "9" * 19, "9999-12-31 00:00:00"
+    for text in ("yesterday", "2023-13-45 00:00:00", "12:03", "12:75:00", "24:00:00", "-1", *beyond):
         with pytest.raises(SystemExit):
             roverflow("try", traverse, f"--at={text}", *SMALL)
         assert "must be seconds after the log's first message, a time as the viewer shows it" in capsys.readouterr().err

@@ -13,6 +13,7 @@ from flow.cli.arguments import MAX_SECONDS
 from flow.contracts import LossReason
 from flow.errors import UsageError
 from recordings.containers.container import RawMessage
+from recordings.containers.time_range import MAX_LATENESS_NS
 
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
@@ -53,8 +54,10 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     chosen = chosen_frame(log, times, at)
     earlier = chosen - _nearest(log, times, before) if isinstance(before, np.datetime64) else before
     low, end = max(0, chosen - earlier), min(times.size, chosen + frames)
-    edges, second = edges_of(log, times), (int(times[chosen]) - log.begin) / 1e9
-    numbers, stamp = (end - chosen, chosen - low), _stamp(log, times, chosen)
+    second, stamp = (int(times[chosen]) - log.begin) / 1e9, _stamp(log, times, chosen)
+    delay = int(times[chosen]) - stamp
+    # The log is cut by stamps, unless these are of another clock.
+    edges, numbers = edges_of(log, times - delay * (abs(delay) < MAX_LATENESS_NS)), (end - chosen, chosen - low)
     return Part(edges[low], edges[end], second, *numbers, stamp, edges[chosen])
 
 

@@ -41,6 +41,7 @@ from tests.recordings.sample_log import (
 )  # fmt: skip
 
 INFO = "/stereo/left/camera_info"
+MS = 1_000_000
 
 
 def test_messages_are_read_bit_for_bit(sample):
@@ -92,13 +93,20 @@ def test_every_file_layout_gives_the_same_items(sample, whole, tmp_path, layout)
     assert inventory_of(other)["frames"]["pairs"] == FRAMES
 
 
-def test_a_range_contains_complete_frames_and_their_tilts(sample):
+def test_a_range_contains_complete_frames_and_their_tilts(sample, tmp_path):
     with McapSource().open(sample, start=0.1, end=0.3) as log:
         assert log.frames == 2
         events = list(log.events())
     stamps = {s: [i.stamp - START for _, stream, i in events if stream == s] for s in ("left", "right", "inclinometer")}
     assert stamps["left"] == stamps["right"] == [PERIOD, 2 * PERIOD]
     assert stamps["inclinometer"] == [number * PERIOD for number in range(FRAMES)]
+    late = rewrite(sample, tmp_path / "late.mcap", time=lambda topic, log_time: log_time + MS * ("stereo" in topic))
+    only = rewrite(late, tmp_path / "images.mcap", lambda topic, _, data: data if "stereo" in topic else None)
+    for start in (None, 0.0):  # images are logged after their stamps, also the log's first message
+        with McapSource().open(only, start=start) as log:
+            assert sum(stream == "left" for _, stream, _ in log.events()) == FRAMES
+            first, *_ = (item.stamp for events in log.excerpts(20, {"left"}) for _, _, item in events)
+            assert first == START
     with pytest.raises(LogError, match=r"sample\.mcap is 0\.400 s long; start 9 s is after its end"):
         McapSource().open(sample, start=9)
     with pytest.raises(LogError, match=r"start 0\.3 s is not before end 0\.2 s; give a smaller start or a larger end"):
