@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import unified_diff
 from heapq import merge
-from itertools import groupby
+from itertools import groupby, zip_longest
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -159,10 +159,10 @@ def _changes(logs: Sequence[McapFile], topics: Mapping[str, TopicDiff]) -> Itera
     """The messages that differ, by stamp and then in the order of `topics`; messages that both have are counted."""
     messages = merge(*(_messages(log, result) for result, log in enumerate(logs)), key=attrgetter("stamp"))
     for stamp, group in groupby(messages, key=attrgetter("stamp")):
-        pairs: dict[str, list[_Message | None]] = {topic: [None, None] for topic in topics}
-        for message in group:
-            pairs[message.channel.topic][message.result] = message
-        for topic, (a, b) in pairs.items():
+        found: dict[str, tuple[list[_Message], list[_Message]]] = {topic: ([], []) for topic in topics}
+        for message in group:  # the last frame has two messages of diagnostics
+            found[message.channel.topic][message.result].append(message)
+        for topic, a, b in ((topic, a, b) for topic, both in found.items() for a, b in zip_longest(*both)):
             topics[topic].messages += a is not None and b is not None
             if (a and a.data) == (b and b.data):
                 continue

@@ -13,6 +13,8 @@ from recordings.ros2.plain import array_of
 from stages.data import Array, Cell, NavigationMap
 
 Measures = dict[str, float]
+MAX_CELLS = 1 << 22  # of the grid that contains two maps
+_APART = "cells of another place"
 _CELLS = {Cell.UNKNOWN: "unknown", Cell.FREE: "free", Cell.HAZARD: "hazard"}
 
 
@@ -33,14 +35,16 @@ def measures(schema: str, one: Any, other: Any) -> Measures:
     return {} if measure is None else {name: value for name, value in measure(one, other).items() if value}
 
 
-def on_one_grid(one: GridLayers, other: GridLayers) -> tuple[GridLayers, GridLayers]:
+def on_one_grid(one: GridLayers, other: GridLayers) -> tuple[GridLayers, GridLayers] | None:
     """The layers that two grids share, float32, on the smallest grid that contains both, with the smaller cells.
 
-    Cells outside are NaN.
+    Cells outside are NaN. None if the grid would have more than `MAX_CELLS`, as where one is far from the other.
     """
     step = min(one.resolution, other.resolution)
     low = np.minimum(one.origin, other.origin)
     high = np.maximum(*(np.add(grid.origin, np.multiply(_shape(grid)[::-1], grid.resolution)) for grid in (one, other)))
+    if ((high - low) / step).prod() > MAX_CELLS:
+        return None
     columns, rows = (np.arange(round(length)) for length in (high - low) / step)
 
     def placed(grid: GridLayers) -> GridLayers:
@@ -63,8 +67,8 @@ def _shape(grid: GridLayers) -> tuple[int, ...]:
     return next(iter(grid.layers.values())).shape
 
 
-def verdicts_on_one_grid(one: NavigationMap, other: NavigationMap) -> tuple[NavigationMap, NavigationMap]:
-    """Two maps on the smallest grid that contains both, with the smaller cells and without reasons."""
+def verdicts_on_one_grid(one: NavigationMap, other: NavigationMap) -> tuple[NavigationMap, NavigationMap] | None:
+    """Two maps on the grid of `on_one_grid`, without reasons."""
     grids = [
         GridLayers({"cells": grid.cells.astype(np.float32)}, grid.origin, grid.resolution) for grid in (one, other)
     ]
@@ -74,7 +78,9 @@ def verdicts_on_one_grid(one: NavigationMap, other: NavigationMap) -> tuple[Navi
         reason = np.zeros(cells.shape, np.uint8)
         return replace(grid, cells=cells, reason=reason, origin=on.origin, resolution=on.resolution)
 
-    first, second = on_one_grid(*grids)
+    if (found := on_one_grid(*grids)) is None:
+        return None
+    first, second = found
     return placed(one, first), placed(other, second)
 
 
@@ -87,7 +93,9 @@ def _disparities(one: Any, other: Any) -> Measures:
 
 
 def _maps(one: Any, other: Any) -> Measures:
-    first, second = (grid.layers for grid in on_one_grid(_grid_of(one), _grid_of(other)))
+    if (grids := on_one_grid(_grid_of(one), _grid_of(other))) is None:
+        return {_APART: float(one.data[0].data.size)}
+    first, second = (grid.layers for grid in grids)
     found = _changes(first["elevation"], second["elevation"], "cells", "cm", 100.0) if "elevation" in first else {}
     others = (name for name in first if name != "elevation")
     return found | {f"cells of layer {name}": float(np.sum(_differ(first[name], second[name]))) for name in others}
@@ -100,7 +108,8 @@ def _grid_of(message: Any) -> GridLayers:
 
 
 def _verdicts(one: Any, other: Any) -> Measures:
-    grids = verdicts_on_one_grid(read_occupancy_grid(one), read_occupancy_grid(other))
+    if (grids := verdicts_on_one_grid(read_occupancy_grid(one), read_occupancy_grid(other))) is None:
+        return {_APART: float(one.data.size)}
     first, second = (grid.cells for grid in grids)
     return {
         f"cells from {name} to {_CELLS[after]}": float(np.sum((first == before) & (second == after)))

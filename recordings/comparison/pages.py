@@ -32,7 +32,8 @@ FLIPS = {
 
 
 def pages(schema: str, one: Any, other: Any) -> tuple[Page, Page, Page] | None:
-    """A, B, and B less A as pages with one extent and one scale; None for two sizes, or a map without elevations.
+    """A, B, and B less A as pages with one extent and one scale; None for two sizes, for maps far apart, or a map
+    without elevations.
 
     schema: full ROS 2 name, in `PAGES`, of the type of the decoded messages.
     """
@@ -69,9 +70,11 @@ def _disparities(one: Any, other: Any) -> tuple[Page, Page, Page] | None:
     return disparity_page(first, limit), disparity_page(second, limit), page
 
 
-def _elevations(one: Any, other: Any) -> tuple[Page, Page, Page]:
+def _elevations(one: Any, other: Any) -> tuple[Page, Page, Page] | None:
     maps = [read_grid_map(message) for message in (one, other)]
     grids = on_one_grid(*(GridLayers(item.layers, item.origin, item.resolution) for item in maps))
+    if grids is None:
+        return None
     first, second = (replace(item, **grid._asdict()) for item, grid in zip(maps, grids, strict=True))
     heights = [grid.layers["elevation"] for grid in grids]
     limits = colormaps.elevation_limits(np.concatenate([layer.ravel() for layer in heights]))
@@ -80,8 +83,11 @@ def _elevations(one: Any, other: Any) -> tuple[Page, Page, Page]:
     return elevation_page(first, limits), elevation_page(second, limits), page
 
 
-def _verdicts(one: Any, other: Any) -> tuple[Page, Page, Page]:
-    first, second = verdicts_on_one_grid(read_occupancy_grid(one), read_occupancy_grid(other))
+def _verdicts(one: Any, other: Any) -> tuple[Page, Page, Page] | None:
+    grids = verdicts_on_one_grid(read_occupancy_grid(one), read_occupancy_grid(other))
+    if grids is None:
+        return None
+    first, second = grids
     before, after = first.cells, second.cells
     codes = np.select([before == after, after == Cell.FREE, after == Cell.HAZARD], [0, 1, 2], 3)
     page = map_page(colormaps.legend_colors(codes, FLIPS), first, "change from A")

@@ -5,6 +5,8 @@ import shutil
 
 import pytest
 
+from flow.contracts import FrameRecord, Loss, LossReason
+from recordings import McapSink
 from recordings.mcap.file import iter_decoded
 from tests.conftest import FRAMES, SMALL, chunks_of, roverflow, slow, with_broken
 
@@ -65,6 +67,21 @@ def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_resul
     one, other = facts["log_digest"]
     assert one != other
     assert f"log_digest: A {one} | B {other}\n" in said(3, "diff", fast_result, out).out
+
+
+def test_a_loss_of_the_last_frame_differs_beside_the_findings_of_the_end(tmp_path, said):
+    def result(name, *losses):
+        sink, path = McapSink(results=(), also=("blur",)), tmp_path / name
+        sink.open(path, {"blur": float}, {"pipeline": "streams: {}", "log": "log.mcap", "overrides": ""})
+        sink.write(FrameRecord(0, 10**18, {"blur": 1.0}, losses, {}, {}))
+        sink.close({"findings": {"health": {"severity": "note", "sentence": "level"}}, "verdict": "COMPLETE"})
+        return path
+
+    lost = Loss("left", 10**18, "source", LossReason.UNREADABLE, "broken")
+    one, same, other = result("a.mcap"), result("b.mcap"), result("c.mcap", lost)
+    assert said(0, "diff", one, same).out.startswith("equal: ")
+    topics = json.loads(said(3, "diff", one, other, "--json").out)["topics"]
+    assert (topics["/nav/diagnostics"]["messages"], topics["/nav/diagnostics"]["differing"]) == (2, 1)
 
 
 def test_copied_inputs_are_not_compared(traverse, fast_result, tmp_path, said):

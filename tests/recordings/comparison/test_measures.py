@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.comparison.measures import measures
-from recordings.ros2.to_msg import disparity_image, image, odometry
+from recordings.ros2.to_msg import disparity_image, grid_map, image, occupancy_grid, odometry
 from stages.data import Pose
 from tests.recordings.sinks.recorded_scene import scene
 
@@ -45,3 +45,13 @@ def test_a_changed_pixel_of_an_image_counts_once(dtype, channels, unknown):
     one, other, small = (image(0, "camera", array) for array in (pixels, changed, pixels[:2]))
     assert measures("sensor_msgs/msg/Image", one, other) == {"pixels": 2}
     assert measures("sensor_msgs/msg/Image", one, small) == {"pixels of another size": 24}
+
+
+def test_maps_far_apart_are_of_another_place():
+    near = scene()["elevation_map"]
+    cells = near.layers["elevation"].size
+    far = replace(near, origin=(near.origin[0] + 2e4, near.origin[1] - 2e4))
+    assert measures("grid_map_msgs/msg/GridMap", grid_map(near), grid_map(far)) == {"cells of another place": cells}
+    verdicts = scene()["navigation_map"]
+    pair = occupancy_grid(verdicts), occupancy_grid(replace(verdicts, origin=(2e4, 2e4)))
+    assert measures("nav_msgs/msg/OccupancyGrid", *pair) == {"cells of another place": verdicts.cells.size}

@@ -79,3 +79,8 @@ def test_letters_are_legible_where_three_pages_share_a_window(width):
     height = np.ptp(rows) * min(1.0, 1600 / 3 / page.shape[1])
     assert 9 <= height <= 20
     assert cv2.countNonZero(page[:margin, :, 0]) > 0
+
+
+def test_maps_far_apart_are_not_drawn():
+    assert pages(MAP, grid_map(terrain(4, 6)), grid_map(terrain(4, 6, origin=(2e4, 2e4)))) is None
+    assert pages(GRID, occupancy_grid(navigation([[0]])), occupancy_grid(navigation([[0]], origin=(2e4, 2e4)))) is None
