@@ -57,7 +57,8 @@ def evaluate(
         if node.aligns:
             lacking[node.name] = node.name
         elif required := absent and absent - ports_of(type(node.actor))[1]:
-            lacking[node.name] = lacking[node.inputs[min(required)]]
+            stream = node.inputs[min(required)]
+            lacking[node.name] = lacking.get(stream, stream)
         elif absent and (why := unfit(node.name, node.actor, inputs)):
             raise UsageError(why)
         else:

@@ -142,7 +142,7 @@ class FrameAssembler:
             for name, aligner in self._aligners.items():
                 self._answer(name, log_time, aligner.tick(log_time))
             if isinstance(item, Exception):
-                self._lose(Loss(stream, log_time, "source", LossReason.UNREADABLE, str(item)))
+                self._lose(Loss(stream, log_time, "source", LossReason.UNREADABLE, str(item) or type(item).__name__))
             elif stream in self.wanted:
                 self.messages[stream] += 1
                 if message.fault:

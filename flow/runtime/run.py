@@ -267,6 +267,8 @@ def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
         except StopIteration:
             return
         except KeyboardInterrupt:
+            if not stop.abandoning():  # nobody turns interrupts into requests
+                raise
             raise _StoppedError from None
         except Exception as error:  # the rest of the log is lost; the events before it are kept
             event, broken = (log_time, "log", error), True

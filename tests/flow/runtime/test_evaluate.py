@@ -72,6 +72,13 @@ def test_what_cannot_be_made_is_refused_in_one_sentence(tmp_path, given, wanted,
     assert str(raised.value) == sentence
 
 
+def test_a_stage_that_reads_the_log_itself_needs_that_stream(tmp_path):
+    toys = graph(tmp_path)
+    nodes = tuple(replace(node, inputs={"couple": "left"}) if node.name == "twice" else node for node in toys.nodes)
+    with pytest.raises(UsageError, match="'twice' needs a stream that only a run makes from a log; give 'left'"):
+        evaluate(replace(toys, nodes=nodes), {}, "twice")
+
+
 def test_a_name_in_place_of_a_pipeline_is_refused():
     with pytest.raises(UsageError, match=r"must be what flow\.config\.loader\.load returns, not a str"):
         evaluate("rover", GIVEN, "sum")  # type: ignore[arg-type]

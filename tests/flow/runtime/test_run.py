@@ -56,8 +56,10 @@ def test_an_unreadable_message_and_a_repeated_stamp_are_in_the_ledger(tmp_path):
     events = traverse(4)
     events.insert(3, (10 * MS, "left", OSError("chunk 7 is damaged")))
     events.insert(3, (11 * MS, "left", Number(0, 5.0)))
+    events.insert(3, (11 * MS, "left", MemoryError()))
     sink, summary = replayed(graph(tmp_path), events)
-    assert summary["drops"] == {"out of order": 1, "unreadable": 1}
+    assert summary["drops"] == {"out of order": 1, "unreadable": 2}
+    assert "MemoryError" in [entry["detail"] for entry in summary["ledger"]]
     assert len(sink.values("raised")) == 4
 
 
@@ -95,6 +97,13 @@ def test_a_log_that_fails_midway_keeps_the_frames_read_before(tmp_path):
     sink, summary = replayed_log(graph(tmp_path), EndsWith(OSError("input/output error"), traverse(5)))
     assert len(sink.values("raised")) == 5
     assert summary["drops"] == {"unreadable": 1}
+
+
+def test_an_interrupt_that_nobody_takes_for_a_request_ends_the_run(tmp_path):
+    pipeline = graph(tmp_path)
+    with pytest.raises(KeyboardInterrupt):
+        replayed_log(pipeline, EndsWith(KeyboardInterrupt(), traverse(5)))
+    assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
 
 
 def test_an_interrupt_finishes_frames_in_flight_and_closes_sinks(tmp_path):
