@@ -130,6 +130,7 @@ def test_the_nearest_cell_of_fast_was_not_searched_at_full_size(traverse, fast_r
 @pytest.mark.parametrize(("words", "why_not"), [
     (("--cell", "1,1"), "traverse.mcap, is not in its folder; give it with --log"),
     (("--cell", "99,1", "--log"), "is outside the map, which has x "),
+    (("--cell", "1e308,1", "--log"), "is outside the map, which has x "),
     (("--pixel", "999,1", "--log"), "is outside the image of 320x240"),
     (("--cell", "1,1", "--map", "nix", "--log"), "navigation map 'nix', only navigation_map, regional_navigation_map"),
 ])  # fmt: skip

@@ -305,20 +305,21 @@ def _place(cloud: PointCloud, pixel: tuple[int, int] | None) -> tuple[float, flo
     if not (0 <= x < width and 0 <= y < height):
         raise UsageError(f"the pixel {x},{y} is outside the image of {width}x{height}")
     rows, cols = np.divmod(cloud.pixel, width)
-    nearest = int(np.argmin((rows - y) ** 2 + (cols - x) ** 2))
-    if math.hypot(rows[nearest] - y, cols[nearest] - x) > REACH_PX:
+    distances = np.hypot(rows - y, cols - x)
+    if not (distances <= REACH_PX).any():
         raise UsageError(
             f"no point of the map is within {REACH_PX:g} px of the pixel {x},{y}: it is unknown or too far"
         )
+    nearest = np.argmin(distances)
     return float(cloud.points[nearest, 0]), float(cloud.points[nearest, 1])
 
 
 def index_of(navigation: NavigationMap, x: float, y: float) -> tuple[int, int] | None:
     """Row and column of the cell at (x, y); None outside the map."""
     offsets = (y - navigation.origin[1], x - navigation.origin[0])
-    row, col = (math.floor(offset / navigation.resolution) for offset in offsets)
+    row, col = (float(np.floor(offset / navigation.resolution)) for offset in offsets)  # which may be infinite
     rows, cols = navigation.cells.shape
-    return (row, col) if 0 <= row < rows and 0 <= col < cols else None
+    return (int(row), int(col)) if 0 <= row < rows and 0 <= col < cols else None
 
 
 def two_numbers(what: str, given: Any) -> Any:

@@ -77,8 +77,8 @@ def reason_to_run(
     return ""
 
 
-def _logs(word: str, folder: Path, where: str = "") -> Iterable[Path]:
-    """The logs that a word of the command line names, or a line of a text file. where: the end of its refusal."""
+def _logs(word: str, folder: Path, lists: tuple[Path, ...] = ()) -> Iterable[Path]:
+    """The logs that a word of the command line names, or a line of a text file. lists: the files that name it."""
     path = Path(word)
     if path.is_dir():
         yield from _in_folder(path, folder)
@@ -87,16 +87,19 @@ def _logs(word: str, folder: Path, where: str = "") -> Iterable[Path]:
             lines = path.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"{path} is neither a log nor a text file of logs") from error
+        if path.absolute() in lists:
+            raise UsageError(f"the text file {path} names itself; take it out of its lines")
         for line in filter(None, (line.partition("#")[0].strip() for line in lines)):
-            yield from _logs(str(path.parent / line), folder, f", which {path} names")
+            yield from _logs(str(path.parent / line), folder, (*lists, path.absolute()))
     elif path.is_file():
         yield path
     else:
         found = sorted(glob(word, recursive=True))  # noqa: PTH207  # a pattern may be absolute
         if not found:
+            where = f", which {lists[-1]} names" if lists else ""
             raise UsageError(f"no file, folder or pattern {word}{where}")
         for item in found:
-            yield from _logs(item, folder)
+            yield from _logs(item, folder, lists)
 
 
 def _in_folder(path: Path, folder: Path) -> Iterable[Path]:
