@@ -23,6 +23,7 @@ class LossReason(StrEnum):
     OUT_OF_ORDER = "out of order"  # its stamp is not after that of the message before it
     UNMATCHED = "unmatched"  # no partner for a pair
     UNALIGNED = "unaligned"  # no sample of another clock's stream for the frame
+    DROPPED = "dropped"  # the workers were busy until the next frame was due (run --rate)
     FAILED = "failed"  # a stage raised an exception
     ABANDONED = "abandoned"  # the run ended before the frame was finished
 

@@ -121,6 +121,17 @@ def every(text: str) -> Every:
     return Every(frames=int(value))
 
 
+def rate(text: str) -> float:
+    """How many times as fast as a log, above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number above 0, such as 1, not '{text}'")
+    return value
+
+
 def pair(text: str) -> tuple[float, float]:
     """Two numbers, such as 3.4,-0.6."""
     try:

@@ -29,6 +29,7 @@ def replay(
     start: float | None = None,
     end: float | None = None,
     every: Every | int | None = None,
+    rate: float | None = None,
     on_frame: Callable[[bool], None] | None = None,
     live_pipe: int = 0,
     profile: str | None = None,
@@ -39,7 +40,7 @@ def replay(
 
     Parameters
     ----------
-    log, pipeline, out, rrd, overrides, workers, start, end, profile, desk, with_inputs
+    log, pipeline, out, rrd, overrides, workers, start, end, rate, profile, desk, with_inputs
         As of `roverflow run`; `overrides` has the texts of --set.
     every
         2 for every second frame, or `flow.runtime.frame_selection.Every(metres=0.5)`.
@@ -76,7 +77,7 @@ def replay(
         about = _about(graph, logs, files, overrides, start, end, every)
         hidden = on_frame is not None or not sys.stderr.isatty()
         with _progress_bar(_frames(opened.frames, every), hidden) as (advance, say), interrupts(stop, say):
-            settings: dict[str, Any] = {"workers": workers, "every": every}
+            settings: dict[str, Any] = {"workers": workers, "every": every, "rate": rate}
             summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
     return as_json(summary | {"overrides": list(overrides)})
 

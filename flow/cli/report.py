@@ -80,6 +80,9 @@ def report(summary: dict[str, Any], compiled: bool = False) -> None:
         begin = summary.get("log_begin" if reason == LossReason.UNREADABLE else "first_stamp")  # log times, stamps
         place = f"{first['stream']} at {_moment(first['stamp'], begin)}"
         say(f"  {number} {reason}, first: {place}: {first['detail']}")
+    if summary["rate"] is not None and (latency := summary["latency_seconds"]):
+        late = f"results {latency['median']:.2f} s after their frame, at most {latency['maximum']:.2f} s"
+        say(f"  at {summary['rate']:g} times the pace of the log: {late}")
     if line := bottleneck_line(summary["bottleneck"]):
         say(f"  {line}")
     for path in summary["withheld"]:

@@ -36,10 +36,12 @@ _NO_ITEM = (Absent, Unchanged)
 @dataclass(eq=False)
 class _Frame:
     """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
-    streams that are there or being made; seconds: of its stages and sinks; begun, done: the work on it."""
+    streams that are there or being made; came: when, s; seconds: of its stages and sinks; begun, done: the
+    work on it."""
 
     index: int
     stamp: int
+    came: float
     values: dict[str, Any]
     entries: list[Loss]
     coming: set[str]
@@ -117,6 +119,7 @@ class Engine:
         self.failure: tuple[str, BaseException] | None = None
         self.admitted = self.through = self.complete = 0
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
+        self._latencies: list[float] = []  # s, from the coming of a frame until it was through
         self.waiting = 0.0  # s that `admit` waited for room
         self.reading = 0.0  # s that the caller took to read the frames, which it sets
         self._threads = [
@@ -132,9 +135,9 @@ class Engine:
 
         Stamps must increase. values: stream -> item or Absent, for every stream that no stage makes.
         """
-        frame = _Frame(self.admitted, stamp, dict(values), list(entries), set(values))
-        frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
         begun = time.perf_counter()
+        frame = _Frame(self.admitted, stamp, begun, dict(values), list(entries), set(values))
+        frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
             self._fits = lambda: len(self._frames) < self._max_frames and self._has_room(first, frame)
@@ -185,6 +188,11 @@ class Engine:
     def cpu_seconds(self) -> dict[str, float]:
         """Stage or sink -> the CPU time of its worker so far, s, without threads that it starts itself."""
         return {work.name: work.cpu_seconds for work in self._work}
+
+    def latency(self) -> dict[str, float]:
+        """Median and maximum of the time from the coming of a frame until it was through, s; empty without a frame."""
+        found = sorted(self._latencies)
+        return {"median": round(found[len(found) // 2], 6), "maximum": round(found[-1], 6)} if found else {}
 
     def bottleneck(self, cores: int) -> dict[str, Any]:
         """What limits the rate of the run, on this number of cores (`flow.runtime.bottleneck`)."""
@@ -326,6 +334,7 @@ class Engine:
             frame = self._frames.popleft()
             complete = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
             self._sink_seconds = {name: frame.seconds[name] for name in self._sink_seconds}
+            self._latencies.append(time.perf_counter() - frame.came)
             self.through += 1
             self.complete += complete
             yield complete

@@ -169,6 +169,12 @@ class FrameAssembler:
             self._waiting[stream].appendleft(Token(frame.stamp, value))
         self._entries = [*frame.entries, *self._entries]
 
+    def drop(self, frame: ReadyFrame, why: str) -> None:
+        """Count a frame that the engine did not admit as lost; its own losses go to the next frame."""
+        causes = [value.cause for value in frame.values.values() if isinstance(value, Absent)]
+        self._entries = [*frame.entries, *causes, *self._entries]
+        self._lose(Loss("frame", frame.stamp, "engine", LossReason.DROPPED, why))
+
     def _take(self, stream: str, log_time: int, token: Token) -> None:
         """Give a token to the aligners that read its stream, and to its frame."""
         if stream in self._waiting:

@@ -22,6 +22,7 @@ from flow.runtime.frame_selection import Every, FrameSelection
 from flow.runtime.graph import Graph
 from flow.runtime.interrupts import Stop
 from flow.runtime.ledger import Ledger, failure
+from flow.runtime.pace import Pace
 from flow.runtime.prepass import Prepass, prepass
 
 
@@ -100,6 +101,7 @@ def run(
     *,
     workers: int = 2,
     every: Every | None = None,
+    rate: float | None = None,
     about: Mapping[str, str] | None = None,
     stop: Stop | None = None,
     on_frame: Callable[[bool], None] = lambda complete: None,
@@ -122,6 +124,9 @@ def run(
         Threads that run the stages.
     every
         The frames to take; the others are left out. Default: all.
+    rate
+        Pace of the frames, as times of that of their stamps: a frame for which no worker is free until the next one is
+        due is dropped. Default: as fast as possible, and no frame is dropped.
     about
         What the sinks record about the run, such as versions.
     stop
@@ -166,7 +171,7 @@ def run(
         facts = {**(about or {}), "surveys": surveys, "fixed": fixed}
         if not stop.finishing() and sinks.open(graph.frame_streams, facts):
             started = time.perf_counter() - wall
-            at_end = _feed(assembler, _read(log.events(assembler.wanted), stop), engine, stop)
+            at_end = _feed(assembler, _read(log.events(assembler.wanted), stop), engine, stop, Pace(rate))
     finally:
         engine.finish(stop.abandoning)
         sinks.errors += [engine.failure] if engine.failure else []
@@ -184,6 +189,7 @@ def run(
             "first_stamp": getattr(log, "first_stamp", None),
             "every": str(every),
             "frames_left_out": selection.left_out,
+            "rate": rate,
             **_counts(assembler, engine, ledger, times),
             "surveys": as_dicts(prepared.findings),
             "fixed": prepared.fixed,
@@ -242,19 +248,27 @@ class _StoppedError(Exception):
     """Ends the reading of a log before its end, so that aligners do not treat the place as the end of the log."""
 
 
-def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop) -> bool:
+def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop, pace: Pace) -> bool:
     """Admit the frames of the log; False if the run was stopped, or an output failed, before the end of the log."""
-    begun = time.perf_counter()
+    begun, paused = time.perf_counter(), 0.0
     try:
         for frame in assembler.frames(events):
-            if not engine.admit(frame.stamp, frame.values, frame.entries, stop.finishing):
-                assembler.give_back(frame)
-                return False
+            came = time.perf_counter()
+            pace.wait(frame.stamp, stop.finishing)
+            paused += time.perf_counter() - came
+            late = pace.late()
+            if late or not engine.admit(
+                frame.stamp, frame.values, frame.entries, lambda: stop.finishing() or pace.late()
+            ):
+                if engine.failure or stop.finishing():
+                    assembler.give_back(frame)
+                    return False
+                assembler.drop(frame, "the log was read too slowly" if late else "no worker was free in time")
         return True
     except _StoppedError:
         return False
     finally:
-        engine.reading = time.perf_counter() - begun - engine.waiting
+        engine.reading = time.perf_counter() - begun - engine.waiting - paused
 
 
 def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
@@ -300,6 +314,7 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
         "cpu_seconds_of": {name: round(value, 6) for name, value in engine.cpu_seconds.items()},
         "reading_seconds": round(engine.reading, 6),
+        "latency_seconds": engine.latency(),
         "bottleneck": engine.bottleneck(usable_cores()),
         **{name: round(value, 6) for name, value in times.items()},
         "frames_per_second": round(engine.through / times["wall_seconds"], 4),

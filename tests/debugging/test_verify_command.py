@@ -19,9 +19,9 @@ def short(traverse, tmp_path_factory):
     """Makes a result of the first frames of the traverse, beside a copy of it."""
     log = Path(shutil.copy(traverse, tmp_path_factory.mktemp("verify")))
 
-    def make(name, *words):
+    def make(name, *words, code=0):
         out = log.with_name(name)
-        assert roverflow("run", log, "-p", "fast", *SMALL, "--end", "1.2", "-o", out, "--no-rrd", *words) == 0
+        assert roverflow("run", log, "-p", "fast", *SMALL, "--end", "1.2", "-o", out, "--no-rrd", *words) == code
         return out
 
     return make
@@ -90,6 +90,8 @@ def test_what_cannot_be_verified_is_refused_in_a_sentence(short, traverse, refus
     assert "traverse.mcap, is not in its folder; give it with --log" in refused("verify", alone)
     stopped = edited(result, tmp_path / "stopped.mcap", interrupted="True")
     assert "was interrupted, so it cannot be repeated; only the file was checked" in refused("verify", stopped)
+    hurried = short("hurried.mcap", "--rate", "1e5", code=3)
+    assert "dropped frames, so it cannot be repeated" in refused("verify", hurried)
     broken = with_broken(result, chunks_of(result)[0][0])
     assert "is damaged: " in refused("verify", broken)
     cut = tmp_path / "cut.mcap"

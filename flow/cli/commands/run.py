@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from flow.cli.arguments import every, seconds, workers
+from flow.cli.arguments import every, rate, seconds, workers
 from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
@@ -51,6 +51,13 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         metavar="N|LENGTH",
         help="take every N-th stereo frame, or one per LENGTH driven, such as 0.5m, by the log's odometry (1)",
     )
+    sub.add_argument(
+        "--rate",
+        type=rate,
+        metavar="R",
+        help="replay at R times the pace of the log and drop the frames that find no free worker, as on the vehicle "
+        "(as fast as possible, no frame dropped)",
+    )
     sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
     sub.add_argument("--summary", type=Path, metavar="OUT.json", help="write counts, losses, times and verdict as JSON")
 
@@ -67,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve or options.desk):
         raise UsageError("--view, --serve and --desk need the recording; leave out --no-rrd")
-    names = ("workers", "start", "end", "every", "profile", "desk", "with_inputs")
+    names = ("workers", "start", "end", "every", "rate", "profile", "desk", "with_inputs")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
         with watched(options.view, options.serve, rrd) as pipe:

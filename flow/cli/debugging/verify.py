@@ -40,8 +40,10 @@ def run(options: argparse.Namespace) -> int:
     changed = _differing(stated, found)
     topics = counted(len(stated), "topic")
     say(f"changed since its run: {', '.join(changed)}" if changed else f"{topics} as the run wrote them")
-    if end_of_run(result).get("interrupted") == "True":
-        raise UsageError(f"the run of {result} was interrupted, so it cannot be repeated; only the file was checked")
+    end = end_of_run(result)
+    if end.get("interrupted") == "True" or "drops.dropped" in end:
+        why = "dropped frames" if "drops.dropped" in end else "was interrupted"
+        raise UsageError(f"the run of {result} {why}, so it cannot be repeated; only the file was checked")
     with TemporaryDirectory(prefix="roverflow-") as folder:
         again = options.out or Path(folder) / "again.mcap"
         logs, notes = _input(result, options.log)

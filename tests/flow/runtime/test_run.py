@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from flow.errors import SinkError, UsageError
+from flow.runtime import pace
 from flow.runtime.interrupts import Stop, interrupts
 from flow.runtime.run import asked, with_spare_threads
 from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, sink_of, traverse
@@ -104,6 +105,59 @@ def test_an_interrupt_that_nobody_takes_for_a_request_ends_the_run(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         replayed_log(pipeline, EndsWith(KeyboardInterrupt(), traverse(5)))
     assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
+
+
+class Clock:
+    """A time that passes in sleep, and by a step with each look."""
+
+    def __init__(self, step):
+        self.now, self.step = 100.0, step
+
+    def perf_counter(self):
+        self.now += self.step
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += seconds
+
+
+def test_frames_come_at_the_pace_of_their_stamps(tmp_path, monkeypatch):
+    monkeypatch.setattr(pace, "time", clock := Clock(0.0))
+    _, summary = replayed(graph(tmp_path), traverse(5), rate=0.5)
+    assert clock.now == pytest.approx(100 + 4 * 0.1 / 0.5)
+    assert (summary["verdict"], summary["frames_out"], summary["rate"]) == ("COMPLETE", 5, 0.5)
+    assert 0 <= summary["latency_seconds"]["median"] <= summary["latency_seconds"]["maximum"]
+
+
+def test_a_frame_that_finds_no_worker_until_the_next_one_is_due_is_dropped(tmp_path, monkeypatch):
+    monkeypatch.setattr(pace, "time", Clock(0.02))
+    pipeline, gate = graph(tmp_path), threading.Event()
+
+    class Gated(Log):
+        def events(self, streams):
+            yield from super().events(streams)
+            gate.set()
+
+    def write(self, record):
+        gate.wait(10)
+        kept(self, record)
+
+    kept = Keep.write
+    monkeypatch.setattr(Keep, "write", write)
+    sink, summary = replayed_log(pipeline, Gated(traverse(5)), workers=2, rate=1.0)  # with three frames in flight
+    assert [record.index for record in sink.records] == [0, 1, 2]
+    assert (summary["verdict"], summary["drops"]) == ("INCOMPLETE", {"dropped": 2})
+    found = [(entry["stamp"], entry["stage"], entry["detail"]) for entry in summary["ledger"]]
+    assert found == [(number * 100 * MS, "engine", "no worker was free in time") for number in (3, 4)]
+
+
+def test_the_losses_of_a_dropped_frame_reach_the_next_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(pace.Pace, "late", lambda self: self._last == 100 * MS)
+    events = [event for event in traverse(3) if event[:2] != (100 * MS, "right")]
+    events.insert(4, (100 * MS, "right", OSError("chunk 7 is damaged")))
+    sink, summary = replayed(graph(tmp_path), events, rate=1000.0)
+    assert summary["drops"]["unreadable"] == 1
+    assert "chunk 7 is damaged" in [entry.detail for entry in sink.records[1].entries]
 
 
 def test_an_interrupt_finishes_frames_in_flight_and_closes_sinks(tmp_path):
