@@ -68,13 +68,16 @@ def first_state(force: Array, bias: Array, accelerometer_bias: float, gravity: f
     return GravityState(np.concatenate([force if gravity is None else gravity * up, bias, np.zeros(3)]), covariance)
 
 
-def restarted(state: GravityState, force: Array, seconds: float) -> GravityState:
-    """The state after a gap: gravity is new in a new frame, the biases have drifted."""
-    first = first_state(force, state.mean[B], 0.0, None)
+def restarted(state: GravityState, force: Array, seconds: float, gravity: float | None) -> GravityState:
+    """The state after a gap of `seconds`: gravity is new in a new frame, the biases have drifted.
+
+    force, gravity: as of `first_state`.
+    """
+    first = first_state(force, state.mean[B], 0.0, gravity)
     covariance = first.covariance
     covariance[B, B] = state.covariance[B, B] + GYROSCOPE_BIAS_WALK**2 * seconds * np.eye(3)
     covariance[A, A] = state.covariance[A, A] + ACCELEROMETER_BIAS_WALK**2 * seconds * np.eye(3)
-    return GravityState(np.concatenate([force, state.mean[3:]]), covariance)
+    return GravityState(np.concatenate([first.mean[S], state.mean[3:]]), covariance)
 
 
 def disturbance(forces: Array) -> float:

@@ -55,6 +55,7 @@ class UpEstimator:
     _waiting: list[InertialSample] = field(default_factory=list)
     _knot: Knot | None = None
     _origin: int = 0
+    _ended: int = 0  # stamp of the end of the estimate before a gap
     _state: GravityState | None = None
     _steps: list[FilterStep] = field(default_factory=list)
     _blocks: Blocks | None = None  # those without tilts yet; one step more than these
@@ -88,7 +89,9 @@ class UpEstimator:
         if self._has_rate():
             self._integrate()
         made = self._tilts(0)
+        self._ended = self._ended if self._knot is None else self._knot.stamp
         self._waiting, self._steps, self._blocks, self._knot = [], [], None, None
+        self._forces = self._forces[:0]  # the next ones are in another frame
         return made
 
     def _has_rate(self) -> bool:
@@ -131,7 +134,7 @@ class UpEstimator:
             return None
         force = forces.mean(axis=0)
         if before is not None:
-            return restarted(before, force, float(blocks.seconds.sum()))
+            return restarted(before, force, (self._origin - self._ended) / 1e9, self.gravity)
         return first_state(force, bias, self.accelerometer_bias, self.gravity)
 
     def _filter(self, blocks: Blocks, bias: Array) -> None:

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.inertial.blocks import InertialSample
+from recordings.inertial.gravity_filter import GYROSCOPE_BIAS_WALK, disturbance
 from recordings.inertial.up_estimator import UpEstimator
 from stages.data import Tilt
 from tests.conftest import data_folder, slow
@@ -73,6 +74,24 @@ def test_a_new_estimate_after_a_gap_keeps_the_biases():
     assert not any(samples[4000].stamp <= tilt.stamp < samples[4500].stamp for tilt in tilts)
     after = driven.errors(tilts)[4000:]
     assert rms(after) < 0.3
+
+
+def test_a_long_gap_leaves_doubt_about_the_gyroscope_and_none_about_a_known_gravity():
+    """After an hour the gyroscope's bias has drifted by two standard deviations, and the rover is tilted otherwise."""
+    driven, estimator = drive(seconds=120), UpEstimator("imu", 0.03, gravity=9.81)
+    before, after = driven.samples()[:6000], driven.samples()[6000:]
+    turn, hour = Rotation.from_euler("y", 15, degrees=True), 3_600_000_000_000
+    drift = np.array([0.0, 2 * GYROSCOPE_BIAS_WALK * 60, 0.0])
+    tilts = [tilt for sample in before for tilt in estimator.push(sample)]
+    sure, usual = estimator._state.covariance[8, 8], disturbance(estimator._forces)
+    for sample in after:
+        rate, force = turn.apply([sample.rate, sample.acceleration])
+        tilts += estimator.push(InertialSample(sample.stamp + hour, tuple(rate + drift), tuple(force)))
+    assert disturbance(estimator._forces) < 1.3 * usual
+    assert estimator._state.covariance[8, 8] < 1.3 * sure
+    late = [tilt for tilt in tilts if tilt.stamp > hour + before[-1].stamp]
+    found = [replace(tilt, stamp=tilt.stamp - hour, up=turn.inv().as_matrix() @ tilt.up) for tilt in late]
+    assert rms(driven.errors(found) / np.sqrt(2) / np.degrees([tilt.sigma for tilt in found])) < 1.2
 
 
 @pytest.mark.parametrize("rates_until", [100, 20])
