@@ -193,8 +193,9 @@ def _opencv_size(content: Mapping[str, Any]) -> tuple[int, int]:
     for names in (("image_width", "image_height"), ("width", "height")):
         if set(names) <= content.keys():
             return _size(content, "the calibration", names)
-    size = content.get("imageSize", content.get("image_size"))
-    return (int(size[0]), int(size[1])) if isinstance(size, list) and len(size) == 2 else (0, 0)
+    name = next((name for name in ("imageSize", "image_size") if name in content), None)
+    width, height = (0, 0) if name is None else numbers(content, name, (2,), "the calibration")
+    return int(width), int(height)
 
 
 def _pinhole(content: Mapping[str, Any], where: str, coefficients: str) -> CameraModel:

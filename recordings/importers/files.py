@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from datetime import datetime
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -73,16 +73,18 @@ def nanoseconds(text: str, where: str) -> int:
         raise LogError(
             f"{where} has the stamp '{text}', not whole nanoseconds; spreadsheets round stamps, so download it again"
         )
-    return _checked(int(text), text, where)
+    return in_ros_time(int(text[:30]), text, where)
 
 
 def from_seconds(text: str, where: str, start: int = 0) -> int:
     """A stamp in ns of decimal seconds after `start`, ns. Raises LogError."""
     try:
-        stamp = start + int((Decimal(text) * 1_000_000_000).to_integral_value())
-    except (InvalidOperation, ValueError, OverflowError) as error:
+        if not abs(seconds := Decimal(text)) < LAST_STAMP:
+            raise OverflowError
+        stamp = start + int((seconds * 1_000_000_000).to_integral_value())
+    except (ArithmeticError, ValueError) as error:
         raise LogError(f"{where} has the time '{text}', not seconds; correct it or get it again") from error
-    return _checked(stamp, text, where)
+    return in_ros_time(stamp, text, where)
 
 
 def from_date(text: str, where: str) -> int:
@@ -100,10 +102,11 @@ def from_date(text: str, where: str) -> int:
         moment = datetime(*map(int, parts), tzinfo=offset)  # type: ignore[arg-type, misc]
     except ValueError as error:
         raise LogError(f"{where} has the time '{text}', not a date and time; correct it or get it again") from error
-    return _checked(int(moment.timestamp()) * 1_000_000_000 + int((fraction or "0").ljust(9, "0")), text, where)
+    return in_ros_time(int(moment.timestamp()) * 1_000_000_000 + int((fraction or "0").ljust(9, "0")), text, where)
 
 
-def _checked(stamp: int, text: str, where: str) -> int:
+def in_ros_time(stamp: int, text: str, where: str) -> int:
+    """A stamp, ns, written as `text`. Raises LogError where ROS cannot express it."""
     if not 0 < stamp < LAST_STAMP:
         raise LogError(f"{where} has the time '{text}', which is not between 1970 and 2038; correct it")
     return stamp

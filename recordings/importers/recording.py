@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from hashlib import sha256
 from heapq import merge
-from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -108,9 +107,9 @@ def write_recording(
             report(f"{out}: an interrupted import of other images is not continued")
         frames = _frames(recording, cameras[0], tree, topics, writer, unreadable, progress)
         events = merge(*recording.sensors, frames, key=itemgetter(0))
-        start = next(events)
-        writer.write("/tf_static", ros2.transform_message((mount, start[0]) for mount in mounts), start[0])
-        for stamp, topic, message in chain([start], events):
+        for number, (stamp, topic, message) in enumerate(events):
+            if number == 0:
+                writer.write("/tf_static", ros2.transform_message((mount, stamp) for mount in mounts), stamp)
             if not isinstance(message, Deferred):
                 writer.write(topic, message, stamp)
             elif not writer.skip(topic, stamp):

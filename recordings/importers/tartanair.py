@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
-from recordings.importers.files import numbers_of, of_size, read_bytes, read_rows, rotation_of
+from recordings.importers.files import in_ros_time, numbers_of, of_size, read_bytes, read_rows, rotation_of
 from recordings.importers.recording import (
     FIRST_STAMP,
     LEFT,
@@ -55,7 +55,10 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
         for name in named
     ]  # fmt: skip
     found = paired(files, "number", source, notes)
-    pairs = [ImagePair(FIRST_STAMP + number * PERIOD_NS, *pair) for number, *pair in found]
+    pairs = [
+        ImagePair(in_ros_time(FIRST_STAMP + number * PERIOD_NS, str(number), str(pair[0])), *pair)
+        for number, *pair in found
+    ]
     track = _track(source / f"pose_{left}.txt")
     size = common_size(pairs)
     camera = rig.camera(size, size[0] / 2, BASELINE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import suppress
 from typing import Any
 
 import cv2
@@ -112,7 +113,10 @@ def unpacked_pixels(data: Array, mosaic: int | None = None) -> Array | None:
 
     mosaic: OpenCV's conversion of a Bayer pattern in a single channel.
     """
-    pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if data.size and _has_whole_chunks(data) else None
+    pixels = None
+    if data.size and _has_whole_chunks(data):
+        with suppress(cv2.error):  # of a size that OpenCV refuses
+            pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         return None
     if pixels.ndim == 2:

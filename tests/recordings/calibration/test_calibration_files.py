@@ -142,6 +142,15 @@ def test_opencv_files_may_have_the_names_of_other_tools(tmp_path, of_k, of_d, tu
     check(read_calibration([written(tmp_path / "stereo.yaml", content)]))
 
 
+@pytest.mark.parametrize("size", [["wide", 4], [None, 4], [float("inf"), 4], [4]])
+def test_a_size_of_opencv_that_is_none_is_refused(tmp_path, size):
+    content = {"R": np.eye(3).tolist(), "T": [-0.2, 0.0, 0.0], "imageSize": size}
+    for n in (0, 1):
+        content |= {f"K{n + 1}": K[n].tolist(), f"D{n + 1}": np.asarray(D[n]).tolist()}
+    with pytest.raises(LogError, match="'imageSize' of the calibration"):
+        read_calibration([written(tmp_path / "stereo.yaml", content)])
+
+
 def camera_info(name: str, shift: float) -> dict[str, Any]:
     matrix = {"rows": 3, "cols": 3, "data": [20.0, 0, 11.5, 0, 20.0, 7.5, 0, 0, 1]}
     return {

@@ -24,6 +24,11 @@ CASES = {
         "no image of 160x120 px can be rectified"),
     "a position that is no number": (
         "drive", "2011_09_26_drive_0001_sync/oxts/data/0000000001.txt", lambda content: b"9" + content, "nan"),
+    "a time beyond all numbers": (
+        "sequence", "sequences/05/times.txt", lambda content: b"1e999999\n" + content, "not seconds"),
+    "a stamp of thousands of digits": (
+        "euroc", "room/mav0/imu0/data.csv", lambda content: content.replace(b"\n17", b"\n" + b"17" * 2500, 1),
+        "not between 1970 and 2038"),
     "MATLAB's file cut off": (
         "katwijk", "P1/LocCam_calibstruct.mat", lambda content: content[:700], "no struct 'stereoParams'"),
     "numpy's header without an end": (

@@ -143,6 +143,16 @@ def test_a_spoilt_file_is_named_in_one_sentence(recording, tmp_path, refused, na
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
 
 
+def test_a_recording_without_readings_and_whole_images_is_refused(recording, tmp_path, refused):
+    folder = shutil.copytree(recording[0], tmp_path / "room") / "mav0"
+    shutil.rmtree(folder / "state_groundtruth_estimate0")
+    (folder / "imu0" / "data.csv").write_text("#timestamp [ns],w_RS_S_x [rad s^-1]\n")
+    for path in (folder / "cam1" / "data").iterdir():
+        path.write_bytes(path.read_bytes()[:-100])
+    why = refused("import", "euroc", tmp_path / "room", tmp_path / "log.mcap")
+    assert "none of 3 pairs can be used, first: " in why
+
+
 def test_an_image_that_is_none_is_left_out_with_a_note(recording, tmp_path, said):
     folder = shutil.copytree(recording[0], tmp_path / "room")
     (path := sorted((folder / "mav0" / "cam1" / "data").iterdir())[1]).write_bytes(b"")

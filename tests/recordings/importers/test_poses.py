@@ -80,6 +80,15 @@ def test_a_trajectory_of_tartanair_is_the_simulators_log(tmp_path, said, cameras
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
+def test_a_number_of_tartanair_beyond_all_times_is_refused(tmp_path, refused):
+    folder = write_tartanair(EXACT, tmp_path / "P000")
+    for side in ("lcam_front", "rcam_front"):
+        (folder / f"image_{side}" / f"000001_{side}.png").rename(folder / f"image_{side}" / f"{10**12}_{side}.png")
+    assert f"{10**12}_lcam_front.png has the time '{10**12}', which is not between 1970 and 2038" in refused(
+        "import", "tartanair", folder, tmp_path / "log.mcap"
+    )
+
+
 def test_the_camera_of_tartanair_looks_90_degrees_wide(tmp_path, refused):
     folder = write_tartanair(EXACT, tmp_path / "P000")
     assert roverflow("import", "tartanair", folder, tmp_path / "log.mcap") == 0

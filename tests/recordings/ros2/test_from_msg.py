@@ -1,5 +1,7 @@
 """ROS 2 messages to data: colour order, byte order, angles as directions."""
 
+import struct
+import zlib
 from typing import Any
 
 import cv2
@@ -12,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from recordings.errors import LogError
 from recordings.ros2.cdr import make
 from recordings.ros2.from_msg import camera_model, pose_of
-from recordings.ros2.image_from_msg import pixels_of
+from recordings.ros2.image_from_msg import pixels_of, unpacked_pixels
 from recordings.ros2.tilt_from_msg import up_of
 from recordings.ros2.to_msg import camera_info, header, image
 from stages.data import CameraModel
@@ -137,3 +139,11 @@ def test_a_zero_or_negative_covariance_is_none(first, known):
     found = pose_of(stamped, 5, "base_link")
     assert found is not None
     assert (found.covariance is not None) == known
+
+
+def test_a_picture_of_a_size_that_opencv_refuses_is_none():
+    _, blob = cv2.imencode(".png", np.zeros((4, 4), np.uint8))
+    content = bytearray(blob.tobytes())
+    content[16:24] = struct.pack(">II", 1 << 20, 1 << 20)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    assert unpacked_pixels(np.frombuffer(content, np.uint8)) is None
