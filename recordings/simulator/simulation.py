@@ -27,6 +27,7 @@ EPOCH = 1_700_000_000 * SECOND
 DAY = 86_400 * SECOND
 MAX_DAYS = 4000  # from the epoch on; limited by the 32-bit seconds of a ROS time
 SENSOR_MARGIN = SECOND // 2  # that the slow sensors run before the first frame and after the last
+MIN_TILE = 2.0  # m, of the repeating ground
 GROUND = ("sand", "dust", "bedrock")  # fields whose shares are at most 1 together
 TILT_RATE, ODOMETRY_RATE, MAST_RATE = 20.0, 10.0, 20.0  # Hz, of an inclinometer, of poses, of a mast that turns
 ROCK_DIAMETERS = 0.06, 1.5  # m, of the smallest and the largest rock
@@ -142,14 +143,14 @@ class Simulation:
         _rad(0.2), "heading error of odometry after 1 m, one sigma; grows with the square root of the distance",
         unit="rad", low=0, high=_rad(90),
     )  # fmt: skip
-    frame_offset: float = parameter(0.013, "time from a tilt sample to a frame", unit="s")
+    frame_offset: float = parameter(0.013, "time from a tilt sample to a frame", unit="s", low=-10, high=10)
     map_half_width: float = parameter(8.0, "half the width of the truth maps", unit="m", low=0.5, high=100)
     map_resolution: float = parameter(0.05, "cells of the truth maps", unit="m", low=0.001, high=10)
     pan: float = parameter(
         0.0, "largest turn of the mast with the cameras, to the left and to the right", unit="rad", low=0, high=_rad(90)
     )
     pan_time: float = parameter(8.0, "time in which the mast turns to both sides and back", unit="s", low=0.1, high=1e4)
-    region: float = parameter(8.0, "largest distance of a visible cell", unit="m")
+    region: float = parameter(8.0, "largest distance of a visible cell", unit="m", low=0.5, high=100)
     seed: int = parameter(1, "seed of the random numbers", low=0, high=10**15)
     threads: int = parameter(2, "threads of the computation; the result does not depend on it", low=1, high=1024)
 
@@ -163,6 +164,8 @@ class Simulation:
             raise ValueError(f"Simulation.sand must be at most 100 % with dust and bedrock, not {ground:g} %")
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
+        if (tile := self.relief_cells * self.relief_resolution) <= MIN_TILE:
+            raise ValueError(f"Simulation.relief_cells must be a ground of over {MIN_TILE:g} m, not of {tile:g} m")
 
     def _ground_left(self) -> float:
         """Share of the ground that the set shares leave."""

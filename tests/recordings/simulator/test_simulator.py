@@ -361,10 +361,17 @@ def test_a_log_of_any_seed_has_stamps_that_can_be_written(seed):
 
 @pytest.mark.parametrize(("name", "value", "why"), [
     ("relief_cells", 1000, "must be a power of two"), ("frames", 0, "must be at least 1, not 0"),
+    ("relief_cells", 32, "must be a power of two"), ("frame_offset", 1e9, "must be at most"),
+    ("region", -1.0, "must be"),
 ])  # fmt: skip
 def test_an_impossible_simulation_is_refused_with_the_parameters_name(name, value, why):
     with pytest.raises(ValueError, match=f"{name} {why}"):
         Simulation(**{name: value})
+
+
+def test_ground_of_a_tile_smaller_than_its_waves_is_refused():
+    with pytest.raises(ValueError, match=r"relief_cells must be a ground of over 2 m, not of 1\.28 m"):
+        Simulation(relief_cells=64, relief_resolution=0.02)
 
 
 def rotation(quaternion) -> np.ndarray:
