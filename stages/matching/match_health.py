@@ -36,14 +36,13 @@ class CheckMatches(Stage):
         return []
 
     def __call__(self, disparity: Disparity, *, state: list[float]) -> MatchHealth:
-        """The matched share of the right half of the image; the right camera does not see all of the left half."""
+        """The matched shares; that of near ground is of the right half, all of which the right camera sees."""
         check_types(self, disparity=disparity)
         height, width = disparity.pixels.shape
-        rows, half = max(1, round(NEAR_ROWS * height)), np.s_[:, width // 2 :]
-        source, confidence = disparity.source[half], disparity.confidence[half]
-        matched = (source == PixelOrigin.MEASURED) | (source == PixelOrigin.PLANE)
-        doubtful = confidence[-rows:] < MIN_CONFIDENCE  # NaN is the confidence of a stage that states none
-        near = float((matched[-rows:] & ~doubtful).mean())
+        ground = np.s_[-max(1, round(NEAR_ROWS * height)) :, width // 2 :]
+        matched = (disparity.source == PixelOrigin.MEASURED) | (disparity.source == PixelOrigin.PLANE)
+        doubtful = disparity.confidence[ground] < MIN_CONFIDENCE  # NaN is the confidence of a stage that states none
+        near = float((matched[ground] & ~doubtful).mean())
         state.append(near)
         return MatchHealth(disparity.stamp, float(matched.mean()), near)
 

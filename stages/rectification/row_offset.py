@@ -147,7 +147,8 @@ def _as_bright(image: Array, model: Array) -> Array:
     if not contrast:
         return image
     scale = other_contrast / contrast
-    return cv2.convertScaleAbs(image, alpha=scale, beta=other_mean - scale * mean)
+    levels = np.clip(np.rint(scale * (np.arange(256) - mean) + other_mean), 0, 255)
+    return cv2.LUT(image, levels.astype(np.uint8))
 
 
 def _centred(x: Array, y: Array, shape: tuple[int, ...]) -> tuple[Array, Array]:

@@ -21,6 +21,8 @@ def test_the_warning_asks_for_the_lowest_rows_and_for_most_frames():
     health = check(ground)
     assert (health.all, health.near) == (0.85, 0)
     assert check.finding() is None
+    matched[1, :, :50] = PixelOrigin.OUT_OF_VIEW
+    assert Running(CheckMatches())(disparity_of(np.ones((80, 100)), matched[1])).all == 0.425
     check(ground)
     check(ground)
     found = check.finding()

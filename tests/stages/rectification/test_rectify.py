@@ -9,7 +9,7 @@ import pytest
 
 from stages.data import CameraModel, StereoCamera, StereoFrame
 from stages.rectification.rectify import Rectify, _rectifying_maps
-from stages.rectification.row_offset import measure, offset_field
+from stages.rectification.row_offset import _as_bright, measure, offset_field
 from tests.conftest import slow
 
 SIZE = WIDTH, HEIGHT = 320, 240
@@ -170,6 +170,11 @@ def test_the_cameras_may_differ_in_exposure(gain, bias):
     left, right = a_pair(TURNED)
     measured = measure([(left, cv2.convertScaleAbs(right, alpha=gain, beta=bias))])
     assert np.abs(off(measured.terms)).max() < 0.2
+
+
+def test_what_is_too_dark_for_the_exposure_of_the_other_camera_is_black():
+    flat, model = np.array([[40, 50, 60, 150, 160]], np.uint8), np.array([[10, 20, 30, 40, 250]], np.uint8)
+    assert np.diff(_as_bright(flat, model).astype(int)).min() >= 0
 
 
 @pytest.mark.parametrize("pairs", [5, *slow(20)])
