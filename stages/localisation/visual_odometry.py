@@ -70,7 +70,7 @@ class VisualOdometry(Stage):
         # The first frame needs only one feature: it may be the only frame.
         if now.known < (1 if before is None else MIN_FEATURES):
             return _untracked(frame.stamp, now, state)
-        lost = _loss(before.frame, now, state.segment + 1) if before is not None else ""
+        lost = _loss(before.frame, now, step, state.segment + 1) if before is not None else ""
         return _new_segment(frame, now, lost, state)
 
     def finding(self, state: OdometryMemory) -> Finding | None:
@@ -83,12 +83,15 @@ def _plausible(step: Step) -> bool:
     return step.rms <= MAX_RMS and float(np.linalg.norm(step.translation)) <= MAX_MOTION
 
 
-def _loss(before: VoFrame, now: VoFrame, segment: int) -> str:
+def _loss(before: VoFrame, now: VoFrame, step: Step | None, segment: int) -> str:
     """Why the segment before ends."""
     sizes = [f"{width}x{height}" for height, width in (before.gray.shape, now.gray.shape)]
     why = f"fewer than {MIN_FEATURES} features agree with the frame before"
     if sizes[0] != sizes[1]:
         why = f"the image size changed from {sizes[0]} to {sizes[1]}"
+    elif step is not None:
+        metres = float(np.linalg.norm(step.translation))
+        why = f"the motion found, {metres:.1f} m with errors of {step.rms:.1f} px, is not plausible"
     return f"{why}; segment {segment} begins"
 
 

@@ -28,6 +28,7 @@ RANSAC_TRIALS = 300
 PATCH = 11  # px, side of the tracked patch; a larger one shows surfaces at several depths
 MAX_PATCH_SHIFT = 6.0  # px, from the patch's position predicted by RANSAC's pose
 MIN_PATCH_SIGMA = 0.05  # px
+MAX_EXPOSURE_CHANGE = 0.1  # natural logarithm of a gain between two images that tracking takes as it is
 FIT_ROUNDS = 8
 ERROR_INFLATION = 4.0  # measured errors over those of independent patches
 MAX_DEPTH = 30.0  # m
@@ -99,13 +100,20 @@ def step_between(earlier: VoFrame, later: VoFrame) -> Step | None:
     if len(here) < MIN_FEATURES:
         return None
     tolerance = RANSAC_TOLERANCE * max(1.0, later.gray.shape[1] / DETECTION_WIDTH)
-    found, turn, shift, agreeing = cv2.solvePnPRansac(
-        earlier.points[here], later.pixels[there].astype(np.float64), matrix, None, iterationsCount=RANSAC_TRIALS,
-        reprojectionError=tolerance, confidence=0.9999, flags=cv2.SOLVEPNP_P3P,
+    points, pixels = earlier.points[here], later.pixels[there].astype(np.float64)
+    found, _, _, agreeing = cv2.solvePnPRansac(
+        points, pixels, matrix, None, iterationsCount=RANSAC_TRIALS, reprojectionError=tolerance, confidence=0.9999,
+        flags=cv2.SOLVEPNP_P3P,
     )  # fmt: skip
     if not found or agreeing is None or len(agreeing) < MIN_FEATURES:
         return None
-    return _tracked_step(earlier, later, matrix, turn, shift)
+    agreeing = agreeing.ravel()
+    # RANSAC ends with a fit by EPnP, which is often wrong where all points lie on a plane, as on flat ground.
+    found, turn, shift = cv2.solvePnP(points[agreeing], pixels[agreeing], matrix, None, flags=cv2.SOLVEPNP_SQPNP)
+    if not found:
+        return None
+    gain = _gain(earlier, later, here[agreeing], there[agreeing])
+    return _tracked_step(earlier, later, matrix, turn, shift, gain)
 
 
 def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
@@ -115,14 +123,31 @@ def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
     return known[here], there
 
 
-def _tracked_step(earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array) -> Step | None:
-    """The pose fitted to patches of the earlier image, tracked from their positions predicted by the given pose."""
+def _gain(earlier: VoFrame, later: VoFrame, here: Array, there: Array) -> float:
+    """How much brighter the later image is, by the median of pairs of features."""
+    before, after = (
+        frame.gray[tuple(np.rint(frame.pixels[which]).astype(int).T[::-1])].astype(np.float64)
+        for frame, which in ((earlier, here), (later, there))
+    )
+    return float(np.median((after + 1) / (before + 1)))
+
+
+def _tracked_step(
+    earlier: VoFrame, later: VoFrame, matrix: Array, turn: Array, shift: Array, gain: float
+) -> Step | None:
+    """The pose fitted to patches of the earlier image, tracked from their positions predicted by the given pose.
+
+    gain: by how much the later image is brighter.
+    """
     points, start, guess = _predicted(earlier, later, matrix, turn, shift)
     if len(points) < MIN_FEATURES:
         return None
+    image = later.gray
+    if abs(np.log(gain)) > MAX_EXPOSURE_CHANGE:  # tracking compares brightness
+        image = cv2.LUT(image, np.clip(np.rint(np.arange(256) / gain), 0, 255).astype(np.uint8))
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 10, 0.02)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        earlier.gray, later.gray, start, guess.copy(), winSize=(PATCH, PATCH), maxLevel=0, criteria=stop,
+        earlier.gray, image, start, guess.copy(), winSize=(PATCH, PATCH), maxLevel=0, criteria=stop,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     good = (status[:, 0] == 1) & (np.linalg.norm(found - guess, axis=1) < MAX_PATCH_SHIFT)

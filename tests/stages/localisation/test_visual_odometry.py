@@ -1,5 +1,6 @@
 """VisualOdometry follows the true camera and reports lost tracking; it never invents a motion."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -19,11 +20,15 @@ SIMULATION = Simulation(scene="gravel", frames=5, width=320, height=240, relief_
 
 @pytest.fixture(scope="module")
 def drive():
+    return frames_of(SIMULATION)
+
+
+def frames_of(simulation):
     """Frames of a drive, each with its true disparity."""
-    truths = [(SIMULATION.stamp(index), SIMULATION.frame(index)) for index in range(SIMULATION.frames)]
+    truths = [(simulation.stamp(index), simulation.frame(index)) for index in range(simulation.frames)]
     return [
-        (StereoFrame(stamp, *truth.images, SIMULATION.camera),
-         replace(true_disparity(SIMULATION, stamp, truth), camera=SIMULATION.camera))
+        (StereoFrame(stamp, *truth.images, simulation.camera),
+         replace(true_disparity(simulation, stamp, truth), camera=simulation.camera))
         for stamp, truth in truths
     ]  # fmt: skip
 
@@ -115,6 +120,28 @@ def test_features_that_agree_only_roughly_are_not_tracked(drive):
     turned, _ = flipped(drive[1], axes=(0, 1))
     _, (_, motion) = tracked(drive[0], (turned, drive[1][1]))
     assert "segment 2 begins" in motion.lost
+
+
+@pytest.mark.parametrize("pitch_down", [15, 35])
+def test_flat_ground_is_tracked(pitch_down):
+    """All points lie on a plane, where a fit by EPnP is ambiguous."""
+    flat = replace(SIMULATION, slope=0.0, abundance=0.0, seed=1, frames=6, pitch_down=float(np.radians(pitch_down)))
+    _, motions = tracked(*frames_of(flat))
+    assert [motion.segment for motion in motions] == [1] * flat.frames
+    assert all(motion.lost == "" for motion in motions)
+
+
+@pytest.mark.parametrize("gain", [0.5, 1.5])
+def test_a_step_of_the_exposure_is_tracked(drive, gain):
+    def exposed(given):
+        frame, disparity = given
+        images = {name: np.clip(gain * getattr(frame, name), 0, 255).astype(np.uint8) for name in ("left", "right")}
+        return replace(frame, **images), disparity
+
+    _, motions = tracked(*(exposed(given) if number % 2 else given for number, given in enumerate(drive)))
+    _, right = tracked(*drive)
+    assert [motion.segment for motion in motions] == [1] * len(drive)
+    assert math.dist(motions[-1].camera.translation, right[-1].camera.translation) < 0.02
 
 
 def test_tracking_continues_after_a_dark_frame(drive):
