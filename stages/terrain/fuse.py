@@ -27,6 +27,7 @@ from stages.terrain.map_registration import FrameGrid, frame_grid, plane_between
 MIN_OVERLAP_CELLS = 100  # of a frame and the map, for their heights to show a jump
 MAX_JUMP = 5.0  # standard deviations of the aligning plane from one frame to the next
 MAX_REJECTED = 3  # frames in succession that do not align; then the map is reset
+MAX_PLANAR = 1e-6  # of x and y of the quaternion of a pose without roll and pitch
 MAX_LEAN_DEG = 5.0  # of the pose's frame; odometry without an inclinometer is off by less than such a mean slope
 MAX_GRADIENT = 3.0  # rise per run of a cell in the variance of misplaced frames; rock edges are steeper
 
@@ -105,6 +106,7 @@ class FuseRegion(Stage):
         known, observed = frame.known, self._observation(frame)
         cells, plane = self._aligned(frame, observed, pose, up, cloud.tilt_sigma or self.tilt_sigma, state)
         state.up_sum += up
+        state.planar &= not np.any(np.abs(pose.quaternion[:2]) > MAX_PLANAR)
         put(cells, known, merged(taken(cells, known), observed.with_plane(plane), state.age(cloud.stamp)))
         hidden = ~known & np.isfinite(frame.ceiling) & (cells["frames"] == 0)
         ceiling = frame.ceiling[hidden] + plane_height(plane, *frame.offsets(hidden))
@@ -141,7 +143,7 @@ class FuseRegion(Stage):
                 f"{counted(state.resets, 'time')} (frame {state.frame_id}); the parts are not aligned."
             )
         lean = float(np.degrees(np.arctan2(np.linalg.norm(state.up_sum[:2]), state.up_sum[2])))
-        if lean > MAX_LEAN_DEG:
+        if lean > MAX_LEAN_DEG and not state.planar:  # planar poses are upright on slopes
             found.append(
                 f"z of the pose's frame '{state.frame_id}' is {lean:.0f} degrees off the vertical of the tilt. The map "
                 "is upright, but its horizontal distances are too short. Record the pose in a frame whose z points up."

@@ -41,6 +41,7 @@ class FusedMap:
     levelling: MapLevelling | None = None  # None before the first frame
     plane: Array = field(default_factory=lambda: np.zeros(3))  # that aligned the last frame
     up_sum: Array = field(default_factory=lambda: np.zeros(3))  # of the tilts, in the map's frame
+    planar: bool = True  # no pose has roll or pitch
     rejected: int = 0  # frames in succession that did not align
     resets: int = 0  # because of them
     logged: Transform | None = None  # frame `level` at the next frame, which the cells of a result log contain already

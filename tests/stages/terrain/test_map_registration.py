@@ -142,6 +142,17 @@ def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
         assert found.severity == "warning"
 
 
+def test_a_pose_without_roll_and_pitch_may_drive_on_a_slope():
+    frames = ((cloud, leant(pose, 12)) for cloud, pose in map(drive, range(4)))
+    fuse, _ = fused((cloud, replace(pose, quaternion=level(pose))) for cloud, pose in frames)
+    assert fuse.finding() is None
+
+
+def level(pose):
+    """Its quaternion with the heading alone."""
+    return Rotation.from_euler("z", Rotation.from_quat(pose.quaternion).as_euler("ZYX")[0]).as_quat()
+
+
 def test_a_refused_frame_does_not_count_as_leaning():
     fuse, _ = fused(drive(frame) for frame in range(3))
     for frame in (3, 4):
