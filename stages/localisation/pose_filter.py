@@ -92,7 +92,7 @@ class PoseFilter(Stage):
         check_types(self, motion=motion, tilt=tilt, mount=mount, logged=logged)
         state.segment = motion.segment
         if logged is not None:
-            state.check.add(motion, logged, mount)
+            state.check.add(motion, logged, mount, mount.camera_from_inclinometer @ tilt.up)
             return logged
         if motion.camera is None:
             raise StageError(f"PoseFilter: no pose from the images: {motion.lost}")

@@ -196,13 +196,48 @@ def test_few_and_short_steps_are_not_judged_and_a_jump_is_long_and_ten_times_the
     assert bool(found) == bool(problem)
 
 
+UP = np.array([0.0, -1.0, 0.0])  # in a level camera
+FORWARD = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # the camera of a rover
+
+
+def bend(number):
+    """The heading at a frame, degrees."""
+    return 7.0 * max(number - 19, 0)
+
+
+def level_turn(degrees):
+    return Rotation.from_euler("z", degrees, degrees=True).as_quat()
+
+
 def test_no_step_leads_over_lost_tracking():
     check, camera = PoseCheck(), FIRST.camera
     far = replace(camera, translation=camera.translation + 9.0)
     lost = replace(FIRST, camera=None)
     for motion in (FIRST, lost, replace(FIRST, camera=far), replace(FIRST, segment=2), replace(FIRST, segment=2)):
-        check.add(motion, LOGGED, MOUNT)
+        check.add(motion, LOGGED, MOUNT, UP)
     np.testing.assert_array_equal(check.steps, np.zeros((1, 3)))
+
+
+@pytest.mark.parametrize(("wrong", "problem"), [
+    (lambda number, pose: pose, ""),
+    (lambda number, pose: replace(pose, quaternion=level_turn(0)), "0.6 m and 0 degrees against 0.6 m and 21 by"),
+    (lambda number, pose: replace(pose, quaternion=level_turn(1.3 * bend(number))), ""),  # as skid steering states it
+    (lambda number, pose: replace(pose, position=pose.position - [0.21 * np.clip(number - 8, 0, 10), 0, 0]),
+     "in 2 of 7 stretches of the drive, first with 0.0 m and 0 degrees against 1.0 m and 0 by the"),
+], ids=["right", "no heading", "turns too far", "stuck"])  # fmt: skip
+def test_a_pose_that_is_wrong_in_a_part_of_the_drive_is_a_warning(wrong, problem):
+    """The rover drives straight for 20 frames and then turns by 7 degrees in each of 10. Most steps are right."""
+    check, place = PoseCheck(), np.zeros(3)
+    for number in range(30):
+        turn = Rotation.from_quat(level_turn(bend(number)))
+        place = place + turn.apply([0.21, 0.0, 0.0])
+        seen = Transform("start", "camera", (turn * FORWARD).as_matrix(), place)
+        pose = wrong(number, Pose(number, place, turn.as_quat(), "odom", "camera"))
+        pose = replace(pose, quaternion=(Rotation.from_quat(pose.quaternion) * FORWARD).as_quat())
+        check.add(replace(FIRST, camera=seen), pose, MOUNT, UP)
+    found = check.problem()
+    assert problem in found
+    assert bool(found) == bool(problem)
 
 
 def test_the_error_of_all_steps_is_half_as_large_sideways():
