@@ -110,7 +110,7 @@ def check(value: Any, known: Field[Any], given: Any = None) -> None:
     if is_number and not _is_finite(value):
         raise ValueError(f"must be a finite number{of_unit}, not {shown}")
     if is_whole and not isinstance(value, numbers.Integral):
-        raise ValueError(f"must be a whole number{of_unit}, not {shown}")
+        raise ValueError(f"must be a whole number{of_unit}, not {shown} ({type(value).__name__})")
     if low is not None and value < low:
         raise ValueError(f"must be at least {_limit(low, unit)}, not {shown}")
     if high is not None and value > high:

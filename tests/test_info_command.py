@@ -123,6 +123,24 @@ def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
     assert f"fewer than 192 disparities: {enough} runs faster" in said(0, "info", traverse).out
 
 
+def test_info_names_the_search_range_as_the_pipeline_has_it(traverse, tmp_path, said):
+    mine = tmp_path / "mine.yaml"
+    head = (
+        "source: {use: recordings.McapSource}\nstreams:\n  stereo: {use: flow.align.pair, left: left, right: right}\n"
+    )
+    end = "\nsinks: [{use: recordings.McapSink}]\n"
+    for stream, name in (
+        ("disparity: {template: rover_disparity, frame: stereo, disparities: 400}", "disparity.disparities"),
+        ("disparity: {use: stages.Match, frame: stereo, disparities: 400}", "disparity.disparities"),
+        ("disparity: {template: rover_disparity, frame: stereo}", "disparity.disparities"),
+    ):
+        mine.write_text(f"{head}  {stream}{end}")
+        (line,) = (line for line in said(0, "info", traverse, "-p", mine).out.splitlines() if "runs faster" in line)
+        change = line.split("--set ")[1].split()[0]
+        assert change.startswith(f"{name}=")
+        assert "runs faster" not in said(0, "info", traverse, "-p", mine, "--set", change).out
+
+
 @pytest.mark.parametrize("times", [1, 10, 1000])  # 1000: written in mm
 def test_info_doubts_a_baseline_for_which_no_search_range_is_enough(traverse, tmp_path, said, times):
     def longer(index: int, message: Any) -> None:

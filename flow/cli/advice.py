@@ -7,6 +7,7 @@ import re
 import shlex
 from argparse import Namespace
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,9 +15,9 @@ import yaml
 
 from flow.cli.outputs import default_result
 from flow.cli.report import duration
-from flow.config.loader import pipeline_file
+from flow.config.loader import load, pipeline_file
 from flow.contracts import counted
-from flow.errors import UsageError
+from flow.errors import PipelineError, UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted
 from flow.units import as_written
@@ -51,7 +52,7 @@ def advice(options: Namespace, description: Mapping[str, Any], graph: Graph) -> 
     lines = [f"  {shlex.join(['roverflow', 'run', *map(str, options.log), *pipeline, *changes])}"]
     if line := _costs(options.pipeline, description):
         lines.append(f"  {line}; it writes {default_result(options.log).name} beside the log")
-    return lines + _range_advice(description["search_range"], graph)
+    return lines + _range_advice(description["search_range"], graph, options)
 
 
 def remedies(description: Mapping[str, Any]) -> list[str]:
@@ -115,17 +116,29 @@ def _costs(pipeline: str, description: Mapping[str, Any]) -> str:
     )
 
 
-def _range_advice(found: Mapping[str, Any] | None, graph: Graph) -> list[str]:
+def _range_advice(found: Mapping[str, Any] | None, graph: Graph, options: Namespace) -> list[str]:
     """What to set if the ground has more disparities than the pipeline searches, or by far fewer."""
-    searched = max((getattr(node.actor, "disparities", 0) for node in graph.nodes), default=0)
-    if found is None or found["doubt"] or not searched:
+    ranges = {node.name: node.actor.disparities for node in graph.nodes if hasattr(node.actor, "disparities")}
+    if found is None or found["doubt"] or not ranges:
         return []
-    enough = f"--set disparities={found['range_px']:.0f}"
+    widest = max(ranges, key=ranges.__getitem__)
+    searched = ranges[widest]
     if searched >= AMPLE * found["range_px"]:
-        return [f"  ground and rocks of {ROCK} m need fewer than {searched} disparities: {enough} runs faster"]
-    if found["ground_px"] < searched:
+        what, gain = f"ground and rocks of {ROCK} m need fewer than {searched} disparities", "runs faster"
+    elif found["ground_px"] < searched:
         return []
-    return [f"  near ground lies beyond the {searched} disparities searched at full size: {enough} includes it"]
+    else:
+        what, gain = f"near ground lies beyond the {searched} disparities searched at full size", "includes it"
+    return [f"  {what}: --set {_range_setting(options, widest, round(found['range_px']))} {gain}"]
+
+
+def _range_setting(options: Namespace, stream: str, value: int) -> str:
+    """The setting of a pipeline that gives a stream a search range: one for all, of its template, or its own."""
+    for owner in ("", f"{stream.partition('/')[0]}."):
+        with suppress(PipelineError):
+            load(options.pipeline, [*options.set, f"{owner}disparities={value}"])
+            return f"{owner}disparities={value}"
+    return f"{stream}.disparities={value}"
 
 
 def _settings(values: Mapping[str, Any]) -> str:
