@@ -125,19 +125,22 @@ def test_info_compares_the_search_range_with_the_ground_in_view(traverse, said):
 
 def test_info_names_the_search_range_as_the_pipeline_has_it(traverse, tmp_path, said):
     mine = tmp_path / "mine.yaml"
-    head = (
-        "source: {use: recordings.McapSource}\nstreams:\n  stereo: {use: flow.align.pair, left: left, right: right}\n"
-    )
-    end = "\nsinks: [{use: recordings.McapSink}]\n"
-    for stream, name in (
-        ("disparity: {template: rover_disparity, frame: stereo, disparities: 400}", "disparity.disparities"),
-        ("disparity: {use: stages.Match, frame: stereo, disparities: 400}", "disparity.disparities"),
-        ("disparity: {template: rover_disparity, frame: stereo}", "disparity.disparities"),
+    pair = "streams:\n  stereo: {use: flow.align.pair, left: left, right: right}"
+    for use in (
+        "{template: rover_disparity, frame: stereo, disparities: 400}",
+        "{template: rover_disparity, frame: stereo}",
+        "{use: stages.Match, frame: stereo, disparities: 400}",
     ):
-        mine.write_text(f"{head}  {stream}{end}")
+        parts = (
+            "source: {use: recordings.McapSource}",
+            pair,
+            f"  disparity: {use}",
+            "sinks: [{use: recordings.McapSink}]",
+        )
+        mine.write_text("\n".join(parts))
         (line,) = (line for line in said(0, "info", traverse, "-p", mine).out.splitlines() if "runs faster" in line)
         change = line.split("--set ")[1].split()[0]
-        assert change.startswith(f"{name}=")
+        assert change.startswith("disparity.disparities=")
         assert "runs faster" not in said(0, "info", traverse, "-p", mine, "--set", change).out
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flow.contracts import Finding, Severity
-from stages.data import Disparity, MatchHealth, PixelOrigin
+from stages.data import Array, Disparity, MatchHealth, PixelOrigin
 from stages.stage import Stage, check_types
 
 NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
@@ -42,9 +42,9 @@ class CheckMatches(Stage):
         ground = np.s_[-max(1, round(NEAR_ROWS * height)) :, width // 2 :]
         matched = (disparity.source == PixelOrigin.MEASURED) | (disparity.source == PixelOrigin.PLANE)
         doubtful = disparity.confidence[ground] < MIN_CONFIDENCE  # NaN is the confidence of a stage that states none
-        near = float((matched[ground] & ~doubtful).mean())
+        near = _share(matched[ground] & ~doubtful)
         state.append(near)
-        return MatchHealth(disparity.stamp, float(matched.mean()), near)
+        return MatchHealth(disparity.stamp, _share(matched), near)
 
     def finding(self, state: list[float]) -> Finding | None:
         """A warning if the median share of the frames is below `MIN_MATCHED`."""
@@ -52,3 +52,7 @@ class CheckMatches(Stage):
         if near >= MIN_MATCHED:
             return None
         return Finding(UNMATCHED.format(near=100 * near), Severity.WARNING, assumes="cameras")
+
+
+def _share(chosen: Array) -> float:
+    return float(np.count_nonzero(chosen) / chosen.size)
