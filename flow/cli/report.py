@@ -81,8 +81,8 @@ def report(summary: dict[str, Any], compiled: bool = False) -> None:
         place = f"{first['stream']} at {_moment(first['stamp'], begin)}"
         say(f"  {number} {reason}, first: {place}: {first['detail']}")
     if summary["rate"] is not None and (latency := summary["latency_seconds"]):
-        late = f"results {latency['median']:.2f} s after their frame, at most {latency['maximum']:.2f} s"
-        say(f"  at {summary['rate']:g} times the pace of the log: {late}")
+        late = f"{latency['median']:.2f} s after it, at most {latency['maximum']:.2f} s"
+        say(f"  at {summary['rate']:g} times the pace of the log: the results of a frame are there {late}")
     if line := bottleneck_line(summary["bottleneck"]):
         say(f"  {line}")
     for path in summary["withheld"]:

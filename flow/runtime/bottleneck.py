@@ -7,7 +7,8 @@ other work divides among the workers. So a run of n workers takes at least `max(
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
+from statistics import median
 from typing import Any
 
 MIN_FRAMES_PER_WORKER = 4  # with fewer frames a run is mostly start and end, and nothing is said about workers
@@ -38,6 +39,14 @@ def bottleneck(
     if frames >= MIN_FRAMES_PER_WORKER * (workers + 1):
         found["another_worker"] = _another_worker(sum(seconds.values()), serial, workers, cores)
     return found
+
+
+def latency(seconds: Sequence[float]) -> dict[str, float]:
+    """Median and maximum of the times from when a frame was due until its stages were through; empty without a frame.
+
+    Sinks and stages that wait for the next frame do not count.
+    """
+    return {"median": round(median(seconds), 6), "maximum": round(max(seconds), 6)} if seconds else {}
 
 
 def _another_worker(busy: float, serial: Mapping[str, float], workers: int, cores: int) -> str:

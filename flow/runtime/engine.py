@@ -17,6 +17,7 @@ A stage may return None, where nothing is new; then `Unchanged` passes through e
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -36,18 +37,19 @@ _NO_ITEM = (Absent, Unchanged)
 @dataclass(eq=False)
 class _Frame:
     """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
-    streams that are there or being made; came: when, s; seconds: of its stages and sinks; begun, done: the
-    work on it."""
+    streams that are there or being made; due: when, s; seconds: of its stages and sinks; begun, done: the work
+    on it; served: whether the stages that do not wait for the next frame are through."""
 
     index: int
     stamp: int
-    came: float
+    due: float
     values: dict[str, Any]
     entries: list[Loss]
     coming: set[str]
     seconds: dict[str, float] = field(default_factory=dict)
     begun: set[_Work] = field(default_factory=set)
     done: set[_Work] = field(default_factory=set)
+    served: bool = False
 
 
 @dataclass(eq=False)
@@ -106,12 +108,14 @@ class Engine:
         self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
         for name, (sink, streams) in sinks.items():
             self._work.append(self._sink_work(name, sink, streams))
+        self._readers: dict[str, list[_Work]] = {}
+        late = set[str | None]()  # streams that wait for the next frame
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
-        self._readers: dict[str, list[_Work]] = {}
-        for work in self._work:
+            late |= {work.output} if work.flushes or late.intersection(work.inputs) else set()
             for stream in work.reads:
                 self._readers.setdefault(stream, []).append(work)
+        self._prompt = {work for work in self._work if work.output and work.output not in late}
         self._ending = self._closed = self._over = False  # _ending: no frame is admitted any more
         self._writing = 0  # workers inside a sink
         self._in_large = 0  # workers inside a large stage
@@ -119,7 +123,7 @@ class Engine:
         self.failure: tuple[str, BaseException] | None = None
         self.admitted = self.through = self.complete = 0
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
-        self._latencies: list[float] = []  # s, from the coming of a frame until it was through
+        self.latencies: list[float] = []  # s, from when a frame was due until its stages were through
         self.waiting = 0.0  # s that `admit` waited for room
         self.reading = 0.0  # s that the caller took to read the frames, which it sets
         self._threads = [
@@ -129,31 +133,46 @@ class Engine:
             thread.start()
 
     def admit(
-        self, stamp: int, values: dict[str, Any], entries: Iterable[Loss], stop: Callable[[], bool] = lambda: False
+        self,
+        stamp: int,
+        values: dict[str, Any],
+        entries: Iterable[Loss],
+        stop: Callable[[], bool] = lambda: False,
+        due: float | None = None,
+        deadline: float = math.inf,
     ) -> bool:
-        """Take in a frame as soon as there is room; False if the engine fails or `stop()` is true before that.
+        """Take in a frame as soon as there is room; False if the engine fails, `stop()` is true or the deadline passes.
 
-        Stamps must increase. values: stream -> item or Absent, for every stream that no stage makes.
+        values: stream -> item or Absent, for every stream that no stage makes; due, deadline: s of `time.perf_counter`.
         """
         begun = time.perf_counter()
-        frame = _Frame(self.admitted, stamp, begun, dict(values), list(entries), set(values))
+        frame = _Frame(self.admitted, stamp, begun if due is None else due, dict(values), list(entries), set(values))
         frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
             self._fits = lambda: len(self._frames) < self._max_frames and self._has_room(first, frame)
-            while self.failure or not self._fits():
-                if self.failure or stop():
-                    return False
-                self._caller.wait(0.1)
+            fits = self._wait_for_room(stop, deadline)
             self.waiting += time.perf_counter() - begun
+            if not fits:
+                return False
             self.admitted += 1
             self._frames.append(frame)
             self._free(frame, tuple(values))
             self._pass_absence(frame)
             retired = list(self._retire())  # a frame without work is through at once
             self._condition.notify_all()
-        self._report(retired)
+        self.report(retired)
         return True
+
+    def _wait_for_room(self, stop: Callable[[], bool], deadline: float) -> bool:
+        while not self.failure:
+            if self._fits():
+                return True
+            left = deadline - time.perf_counter()
+            if stop() or left <= 0:
+                return False
+            self._caller.wait(min(0.1, left))
+        return False
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> None:
         """Wait until every frame is through, the engine has failed, or `stop()` is true; then end the workers.
@@ -188,11 +207,6 @@ class Engine:
     def cpu_seconds(self) -> dict[str, float]:
         """Stage or sink -> the CPU time of its worker so far, s, without threads that it starts itself."""
         return {work.name: work.cpu_seconds for work in self._work}
-
-    def latency(self) -> dict[str, float]:
-        """Median and maximum of the time from the coming of a frame until it was through, s; empty without a frame."""
-        found = sorted(self._latencies)
-        return {"median": round(found[len(found) // 2], 6), "maximum": round(found[-1], 6)} if found else {}
 
     def bottleneck(self, cores: int) -> dict[str, Any]:
         """What limits the rate of the run, on this number of cores (`flow.runtime.bottleneck`)."""
@@ -236,10 +250,10 @@ class Engine:
                     self.failure = self.failure or (work.name, error)
                 self._condition.notify_all()
             del work, frame, task, value  # a worker that waits must keep no item
-            self._report(retired)
+            self.report(retired)
 
-    def _report(self, retired: list[bool]) -> None:
-        """Report progress, outside the lock. A progress display that fails must not stop the run."""
+    def report(self, retired: list[bool]) -> None:
+        """Report frames, complete or not, outside the lock. A progress display that fails must not stop the run."""
         for complete in retired:
             with self._reporting, suppress(Exception):
                 self._on_frame(complete)
@@ -303,6 +317,9 @@ class Engine:
 
     def _complete(self, work: _Work, frame: _Frame) -> None:
         frame.done.add(work)
+        if not frame.served and frame.done.issuperset(self._prompt):
+            frame.served = True
+            self.latencies.append(time.perf_counter() - frame.due)
         self._free(frame, work.reads if work.output is None else (*work.reads, work.output))
         while work.ordered and any(f.index == work.next and work in f.done for f in self._frames):
             work.next += 1
@@ -334,7 +351,6 @@ class Engine:
             frame = self._frames.popleft()
             complete = not self.failure and not any(isinstance(value, Absent) for value in frame.values.values())
             self._sink_seconds = {name: frame.seconds[name] for name in self._sink_seconds}
-            self._latencies.append(time.perf_counter() - frame.came)
             self.through += 1
             self.complete += complete
             yield complete

@@ -12,26 +12,25 @@ STEP = 0.1  # s, between looks at a request to stop
 class Pace:
     """When frames are due. rate: times as fast as their stamps, None for as fast as possible.
 
-    A frame that cannot start before the next one is due, by the last interval, is too late.
+    due: of the frame that was waited for, s of `time.perf_counter`, None without a rate; deadline: when the next one is
+    due, by the last interval.
     """
 
     def __init__(self, rate: float | None) -> None:
-        self._rate, self._last, self._due, self._deadline = rate, -1, 0.0, math.inf
+        self.due: float | None = None
+        self.deadline = math.inf
+        self._rate, self._last = rate, 0
 
     def wait(self, stamp: int, stop: Callable[[], bool]) -> None:
         """Wait until the frame of a stamp, ns, is due, or until `stop()` is true. The first frame is due at once."""
         if self._rate is None:
             return
-        if self._last < 0:
-            self._due = time.perf_counter()
+        if self.due is None:
+            self.due = time.perf_counter()
         else:
             interval = (stamp - self._last) / 1e9 / self._rate
-            self._due += interval
-            self._deadline = self._due + interval
+            self.due += interval
+            self.deadline = self.due + interval
         self._last = stamp
-        while (left := self._due - time.perf_counter()) > 0 and not stop():
+        while (left := self.due - time.perf_counter()) > 0 and not stop():
             time.sleep(min(left, STEP))
-
-    def late(self) -> bool:
-        """Whether it is too late for the frame that was waited for."""
-        return time.perf_counter() >= self._deadline

@@ -14,7 +14,7 @@ from typing import Any
 
 from flow.contracts import MAX_WORKERS, Event, Finding, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
-from flow.runtime.bottleneck import usable_cores
+from flow.runtime.bottleneck import latency, usable_cores
 from flow.runtime.engine import Engine
 from flow.runtime.findings import as_dicts, findings, has_fault, warning
 from flow.runtime.frame_assembler import FrameAssembler
@@ -197,6 +197,8 @@ def run(
             "outputs": [str(outputs[use]) for use in sinks.opened],
             "withheld": [str(outputs[use]) for use in sinks.withheld],
         }
+        if rate is not None:  # the pace is the limit
+            summary["bottleneck"].pop("another_worker", None)
         sinks.close(summary)
     return summary
 
@@ -256,14 +258,14 @@ def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, st
             came = time.perf_counter()
             pace.wait(frame.stamp, stop.finishing)
             paused += time.perf_counter() - came
-            late = pace.late()
-            if late or not engine.admit(
-                frame.stamp, frame.values, frame.entries, lambda: stop.finishing() or pace.late()
-            ):
-                if engine.failure or stop.finishing():
-                    assembler.give_back(frame)
-                    return False
-                assembler.drop(frame, "the log was read too slowly" if late else "no worker was free in time")
+            given = frame.stamp, frame.values, frame.entries
+            if not stop.finishing() and engine.admit(*given, stop.finishing, pace.due, pace.deadline):
+                continue
+            if engine.failure or stop.finishing():
+                assembler.give_back(frame)
+                return False
+            assembler.drop(frame, "no worker was free until the next frame was due")
+            engine.report([False])
         return True
     except _StoppedError:
         return False
@@ -314,7 +316,7 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
         "cpu_seconds_of": {name: round(value, 6) for name, value in engine.cpu_seconds.items()},
         "reading_seconds": round(engine.reading, 6),
-        "latency_seconds": engine.latency(),
+        "latency_seconds": latency(engine.latencies),
         "bottleneck": engine.bottleneck(usable_cores()),
         **{name: round(value, 6) for name, value in times.items()},
         "frames_per_second": round(engine.through / times["wall_seconds"], 4),

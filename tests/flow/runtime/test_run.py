@@ -5,14 +5,18 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
 from flow.errors import SinkError, UsageError
 from flow.runtime import pace
+from flow.runtime.bottleneck import latency
+from flow.runtime.engine import Engine
 from flow.runtime.interrupts import Stop, interrupts
+from flow.runtime.ledger import Ledger
 from flow.runtime.run import asked, with_spare_threads
-from tests.flow.toys import MS, PIPELINE, Keep, Log, Number, graph, replayed, replayed_log, sink_of, traverse
+from tests.flow.toys import MS, PIPELINE, Couple, Keep, Log, Number, graph, replayed, replayed_log, sink_of, traverse
 
 
 def test_a_failing_frame_is_recorded_and_the_others_go_on(tmp_path):
@@ -108,13 +112,12 @@ def test_an_interrupt_that_nobody_takes_for_a_request_ends_the_run(tmp_path):
 
 
 class Clock:
-    """A time that passes in sleep, and by a step with each look."""
+    """A time that passes only in sleep. start: s after that of the workers."""
 
-    def __init__(self, step):
-        self.now, self.step = 100.0, step
+    def __init__(self, start):
+        self.start = self.now = time.perf_counter() + start
 
     def perf_counter(self):
-        self.now += self.step
         return self.now
 
     def sleep(self, seconds):
@@ -122,16 +125,16 @@ class Clock:
 
 
 def test_frames_come_at_the_pace_of_their_stamps(tmp_path, monkeypatch):
-    monkeypatch.setattr(pace, "time", clock := Clock(0.0))
+    monkeypatch.setattr(pace, "time", clock := Clock(1e6))
     _, summary = replayed(graph(tmp_path), traverse(5), rate=0.5)
-    assert clock.now == pytest.approx(100 + 4 * 0.1 / 0.5)
+    assert clock.now - clock.start == pytest.approx(4 * 0.1 / 0.5)
     assert (summary["verdict"], summary["frames_out"], summary["rate"]) == ("COMPLETE", 5, 0.5)
-    assert 0 <= summary["latency_seconds"]["median"] <= summary["latency_seconds"]["maximum"]
+    assert "another_worker" not in summary["bottleneck"]
 
 
 def test_a_frame_that_finds_no_worker_until_the_next_one_is_due_is_dropped(tmp_path, monkeypatch):
-    monkeypatch.setattr(pace, "time", Clock(0.02))
-    pipeline, gate = graph(tmp_path), threading.Event()
+    monkeypatch.setattr(pace, "time", Clock(-1e6))  # so all deadlines are over
+    pipeline, gate, reported = graph(tmp_path), threading.Event(), []
 
     class Gated(Log):
         def events(self, streams):
@@ -144,20 +147,69 @@ def test_a_frame_that_finds_no_worker_until_the_next_one_is_due_is_dropped(tmp_p
 
     kept = Keep.write
     monkeypatch.setattr(Keep, "write", write)
-    sink, summary = replayed_log(pipeline, Gated(traverse(5)), workers=2, rate=1.0)  # with three frames in flight
-    assert [record.index for record in sink.records] == [0, 1, 2]
-    assert (summary["verdict"], summary["drops"]) == ("INCOMPLETE", {"dropped": 2})
+    sink, summary = replayed_log(pipeline, Gated(traverse(6)), workers=2, rate=1.0, on_frame=reported.append)
+    kept_frames = len(sink.records)  # two or three are in flight
+    assert [record.index for record in sink.records] == list(range(kept_frames))
+    assert (summary["verdict"], summary["drops"]) == ("INCOMPLETE", {"dropped": 6 - kept_frames})
     found = [(entry["stamp"], entry["stage"], entry["detail"]) for entry in summary["ledger"]]
-    assert found == [(number * 100 * MS, "engine", "no worker was free in time") for number in (3, 4)]
+    why = "no worker was free until the next frame was due"
+    assert found == [(number * 100 * MS, "engine", why) for number in range(kept_frames, 6)]
+    assert 2 <= kept_frames <= 3
+    assert sorted(reported) == [False] * (6 - kept_frames) + [True] * kept_frames
+
+
+def test_a_deadline_ends_the_wait_for_room(tmp_path):
+    gate = threading.Event()
+
+    class Waiting(Keep):
+        def write(self, record):
+            gate.wait(10)
+
+    engine = Engine(graph(tmp_path).stages, {"sink": (Waiting(), [])}, Ledger(), workers=1, max_frames=2)
+    values, now = {"both": Couple(0, 0.0), "height": Couple(0, 0.0)}, time.perf_counter()
+    assert [engine.admit(index, values, [], deadline=now + 0.02) for index in range(3)] == [True, True, False]
+    assert engine.waiting >= 0.01
+    gate.set()
+    engine.finish()
 
 
 def test_the_losses_of_a_dropped_frame_reach_the_next_one(tmp_path, monkeypatch):
-    monkeypatch.setattr(pace.Pace, "late", lambda self: self._last == 100 * MS)
-    events = [event for event in traverse(3) if event[:2] != (100 * MS, "right")]
-    events.insert(4, (100 * MS, "right", OSError("chunk 7 is damaged")))
-    sink, summary = replayed(graph(tmp_path), events, rate=1000.0)
-    assert summary["drops"]["unreadable"] == 1
-    assert "chunk 7 is damaged" in [entry.detail for entry in sink.records[1].entries]
+    admit = Engine.admit
+
+    def admitted(self, stamp, *given):
+        return stamp != 100 * MS and admit(self, stamp, *given)
+
+    monkeypatch.setattr(Engine, "admit", admitted)
+    events = [event for event in traverse(3) if event[:2] != (150 * MS, "level")]
+    events.insert(4, (90 * MS, "left", OSError("chunk 7 is damaged")))
+    text = PIPELINE.replace("stream: level, at: both", "stream: level, at: both, max_gap: 120 ms")
+    sink, summary = replayed(graph(tmp_path, text=text), events, rate=1000.0)
+    assert [record.stamp for record in sink.records] == [0, 200 * MS]
+    assert summary["drops"]["dropped"] == 1
+    details = [entry.detail for entry in sink.records[1].entries]
+    assert "chunk 7 is damaged" in details
+    assert sum(entry.stamp == 100 * MS for entry in sink.records[1].entries) == 2  # dropped, and without a height
+
+
+def test_an_interrupt_in_the_wait_for_a_frame_gives_it_back(tmp_path, monkeypatch):
+    stop, monkeyed = Stop(), pace.Pace.wait
+
+    def wait(self, stamp, stopped):
+        if stamp == 200 * MS:
+            stop.request()
+        monkeyed(self, stamp, stopped)
+
+    monkeypatch.setattr(pace.Pace, "wait", wait)
+    sink, summary = replayed(graph(tmp_path), traverse(5), rate=1000.0, stop=stop)
+    assert max(record.stamp for record in sink.records) < 200 * MS
+    assert summary["interrupted"]
+
+
+def test_the_latency_is_that_of_stages_that_do_not_wait_for_the_next_frame(tmp_path):
+    _, summary = replayed(graph(tmp_path, nap=0.005), traverse(3))
+    assert 0.005 <= summary["latency_seconds"]["median"] <= summary["latency_seconds"]["maximum"]
+    assert latency([]) == {}
+    assert latency([3.0, 1.0, 2.0]) == {"median": 2.0, "maximum": 3.0}
 
 
 def test_an_interrupt_finishes_frames_in_flight_and_closes_sinks(tmp_path):
