@@ -15,6 +15,7 @@ from flow.runtime.frame_selection import Every
 from flow.runtime.graph import Graph
 
 RESULT_TYPES = "rosbags.typesys.stores.ros2_jazzy"  # the module of a result log's message types
+LIBRARIES = ("numpy", "opencv-python-headless", "numba", "scikit-image", "scipy")  # that decide the bits of a result
 ARROW_EXTRA = "pandas"  # which the library of recordings imports, where it is installed
 
 
@@ -192,8 +193,7 @@ def as_json(summary: dict[str, Any]) -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """The versions of what results depend on."""
-    parts = ("numpy", "opencv-python-headless", "numba", "scikit-image")
-    return {"roverflow": product_version(), **{name: version(name) for name in parts}}
+    return {"roverflow": product_version(), **{name: version(name) for name in LIBRARIES}}
 
 
 def product_version() -> str:

@@ -1,4 +1,4 @@
-"""Digests of the messages of a log, topic by topic: equal ones mean equal messages."""
+"""Digests of the messages of a log, topic by topic: of their stamps, lengths and CRC-32."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader
 
 
 class Digests:
-    """The digest of each topic: of the stamps, lengths and CRC-32 of its messages."""
+    """The digest of each topic so far."""
 
     def __init__(self) -> None:
         self._of: defaultdict[str, Any] = defaultdict(hashlib.sha1)
@@ -27,16 +27,15 @@ class Digests:
         return {topic: digest.hexdigest()[:32] for topic, digest in self._of.items()}
 
 
-def digests_of(log: Path) -> dict[str, str]:
-    """Topic -> digest of the messages of its first channel in the file: copies of inputs come after the results.
+def digests_of(log: Path, copies: bool) -> dict[str, str]:
+    """Topic -> digest of its messages. Raises mcap's errors if the log is damaged.
 
-    Raises mcap's errors, and LogError where a checksum is wrong, if the log is damaged.
+    copies: whether channels after the first one of a topic contain copies of inputs, which do not count.
     """
-    digests, channels = Digests(), dict[str, int]()
-    topics = dict[int, str]()
+    digests, first, topics = Digests(), dict[str, int](), dict[int, str]()
     with log.open("rb") as file:
         for record in StreamReader(file, validate_crcs=True).records:
-            if isinstance(record, Channel) and channels.setdefault(record.topic, record.id) == record.id:
+            if isinstance(record, Channel) and (first.setdefault(record.topic, record.id) == record.id or not copies):
                 topics[record.id] = record.topic
             elif isinstance(record, Message) and record.channel_id in topics:
                 digests.add(topics[record.channel_id], record.log_time, record.data)

@@ -143,7 +143,9 @@ class McapSink:
         self._theirs = parents_in([Path(log) for log in self.inputs]) if self.inputs else {}
         self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression, digests=True)
         try:
-            self._writer.metadata("roverflow", about if self.profile == "ros2" else {**about, "profile": self.profile})
+            own = {"profile": self.profile, "with_inputs": "yes" if self.inputs else ""}
+            own = {name: value for name, value in own.items() if value not in ("ros2", "")}
+            self._writer.metadata("roverflow", {**about, **own})
             self._writer.attachment("pipeline.yaml", "application/yaml", _as_ran(about).encode())
         except BaseException:
             self._writer.abort()

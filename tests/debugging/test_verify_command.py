@@ -1,6 +1,7 @@
 """`roverflow verify`: a result log is as its run wrote it, and the same run gives it again."""
 
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,21 @@ import pytest
 from mcap.reader import make_reader
 
 from flow.cli import replay
+from flow.cli.debugging import verify
 from recordings.mcap.writer import MessageKind, Ros2Writer
 from tests.conftest import SMALL, chunks_of, edit_of, mcap_rows, rewrite, roverflow, with_broken
 
 TOPICS = "13 topics"
+OWN = """
+from dataclasses import dataclass
+from stages import StereoFrame
+
+
+@dataclass(frozen=True)
+class Sharpness:
+    def __call__(self, frame: StereoFrame) -> float:
+        return float(frame.left.std())
+"""
 
 
 @pytest.fixture(scope="module")
@@ -19,22 +31,27 @@ def short(traverse, tmp_path_factory):
     """Makes a result of the first frames of the traverse, beside a copy of it."""
     log = Path(shutil.copy(traverse, tmp_path_factory.mktemp("verify")))
 
-    def make(name, *words, code=0):
+    def make(name, *words):
         out = log.with_name(name)
-        assert roverflow("run", log, "-p", "fast", *SMALL, "--end", "1.2", "-o", out, "--no-rrd", *words) == code
+        assert roverflow("run", log, "-p", "fast", *SMALL, "--end", "1.2", "-o", out, "--no-rrd", *words) == 0
         return out
 
     return make
 
 
-def edited(result, out, change=lambda topic, data: data, **facts):
-    """A result log with other messages, or with other facts of the end of its run."""
+def edited(result, out, change=lambda topic, data: data, more="", **facts):
+    """A result log with other messages, one more on a topic, or with other facts of the end of its run."""
     with result.open("rb") as file:
-        records = {record.name: record.metadata | facts for record in make_reader(file).iter_metadata()}
+        records = {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
+    records["roverflow.run"] |= facts
     with Ros2Writer(out) as writer:
         writer.metadata("roverflow", records.pop("roverflow"))
         for topic, encoding, schema, stamp, data in mcap_rows(result):
-            writer.add(topic, MessageKind(schema[0], encoding, *schema[1:]), stamp, change(topic, data))
+            kind = MessageKind(schema[0], encoding, *schema[1:])
+            writer.add(topic, kind, stamp, change(topic, data))
+            if topic == more:
+                writer.add(topic, kind, stamp, data, copy_of=7)  # in a channel of its own
+                more = ""
         for name, values in records.items():
             writer.metadata(name, values)
     return out
@@ -60,6 +77,41 @@ def test_a_changed_message_is_found(short, said, tmp_path):
     first, *_, last = said(3, "verify", other, "--log", result.with_name("traverse.mcap")).out.splitlines()
     assert first == "changed since its run: /nav/points"
     assert last == f"{TOPICS} the same in a second run of traverse.mcap"
+
+
+def test_an_added_message_is_found_and_stays_found_without_the_input(short, said, tmp_path):
+    result = short("added.mcap")
+    other = edited(result, tmp_path / "out.mcap", more="/nav/points")
+    assert said(3, "verify", other, "--log", result.with_name("traverse.mcap")).out.startswith(
+        "changed since its run: /nav/points\n"
+    )
+    first, second = said(3, "verify", other).out.splitlines()
+    assert first == "changed since its run: /nav/points"
+    assert second.startswith("not run again: the input of ")
+
+
+def test_an_interrupted_second_run_is_not_compared(short, said, monkeypatch):
+    def interrupted(*given, **options):
+        return replay.replay(*given, **options) | {"interrupted": True}
+
+    result = short("calm.mcap")
+    monkeypatch.setattr(verify, "replay", interrupted)
+    assert said(130, "verify", result).out.splitlines()[-1] == "interrupted: the second run was not compared"
+
+
+def test_a_stage_beside_the_result_is_found(traverse, tmp_path, monkeypatch, said):
+    (tmp_path / "own_stages.py").write_text(OWN)
+    log, mine = Path(shutil.copy(traverse, tmp_path)), tmp_path / "mine.yaml"
+    mine.write_text(
+        "source: {use: recordings.McapSource}\nstreams:\n"
+        "  stereo: {use: flow.align.pair, left: left, right: right}\n"
+        "  sharpness: {use: own_stages.Sharpness, frame: stereo}\n"
+        "sinks: [{use: recordings.McapSink, also: [sharpness]}]\n"
+    )
+    assert roverflow("run", log, "-p", mine, "-o", tmp_path / "own.mcap", "--no-rrd") == 0
+    monkeypatch.setattr("sys.path", [path for path in sys.path if path != str(tmp_path)])
+    monkeypatch.delitem(sys.modules, "own_stages")
+    assert said(0, "verify", tmp_path / "own.mcap").out.count("2 topics") == 2
 
 
 def test_another_input_gives_other_results_and_the_versions_are_named(short, traverse, said, tmp_path, monkeypatch):
@@ -90,7 +142,7 @@ def test_what_cannot_be_verified_is_refused_in_a_sentence(short, traverse, refus
     assert "traverse.mcap, is not in its folder; give it with --log" in refused("verify", alone)
     stopped = edited(result, tmp_path / "stopped.mcap", interrupted="True")
     assert "was interrupted, so it cannot be repeated; only the file was checked" in refused("verify", stopped)
-    hurried = short("hurried.mcap", "--rate", "1e5", code=3)
+    hurried = edited(result, tmp_path / "hurried.mcap", **{"drops.dropped": "2"})
     assert "dropped frames, so it cannot be repeated" in refused("verify", hurried)
     broken = with_broken(result, chunks_of(result)[0][0])
     assert "is damaged: " in refused("verify", broken)

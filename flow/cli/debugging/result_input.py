@@ -26,15 +26,17 @@ def graph_of(result: Path, changes: Sequence[str] = (), *, with_sinks: bool = Fa
     from recordings.scoring.result_log import facts_of, pipeline_of
 
     about = facts_of(result, RESULT)
-    with pipeline_of_run(about, pipeline_of(result)) as file:
+    with pipeline_of_run(about, result, pipeline_of(result)) as file:
         own = [*about["overrides"].splitlines(), *about.get("fixed", "").splitlines()]
         return load(str(file), [*own, *changes], with_sinks=with_sinks)
 
 
 @contextmanager
-def pipeline_of_run(about: Mapping[str, str], name: str) -> Iterator[Path]:
+def pipeline_of_run(about: Mapping[str, str], result: Path, name: str) -> Iterator[Path]:
     """The pipeline of a run in a temporary file of this name. about: the facts of the run."""
-    sys.path.append(str(Path.cwd()))  # so that stages can be in this folder
+    for place in map(str, (Path.cwd(), result.resolve().parent)):  # so that stages can be there
+        if place not in sys.path:
+            sys.path.append(place)
     with TemporaryDirectory(prefix="roverflow-") as folder:
         file = Path(folder) / f"{name}.yaml"
         file.write_text(about["pipeline"], encoding="utf-8")

@@ -7,13 +7,14 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from flow.cli.arguments import every, workers
 from flow.cli.outputs import check_outputs
 from flow.cli.replay import replay, versions
 from flow.cli.report import say
 from flow.contracts import counted
-from flow.errors import COMPLETE, DIFFERENT, UsageError
+from flow.errors import COMPLETE, DIFFERENT, INTERRUPTED, UsageError
 
 HELP = "check that a result log is as its run wrote it, and that the same run gives the same messages again"
 
@@ -31,76 +32,85 @@ def run(options: argparse.Namespace) -> int:
     result: Path = options.result
     check_outputs({"result log": options.out}, [result, *(options.log or [])])
     from flow.cli.debugging.result_input import RESULT
-    from recordings.scoring.result_log import end_of_run, facts_of, names_of
+    from recordings.scoring.result_log import end_of_run, facts_of
 
     about, stated = facts_of(result, RESULT), end_of_run(result, "roverflow.digests")
     if not stated:
         raise UsageError(f"{result} has no digests of its topics, because its end is missing; run its log again")
-    found = _digests(result)
-    changed = _differing(stated, found)
+    changed = _differing(stated, _digests(result, stated, about))
     topics = counted(len(stated), "topic")
     say(f"changed since its run: {', '.join(changed)}" if changed else f"{topics} as the run wrote them")
+    try:
+        return max(_second_run(options, about, stated, topics), DIFFERENT if changed else COMPLETE)
+    except UsageError as error:
+        if not changed:
+            raise
+        say(f"not run again: {error}")
+        return DIFFERENT
+
+
+def _second_run(options: argparse.Namespace, about: Mapping[str, str], stated: Mapping[str, str], topics: str) -> int:
+    """Repeat the run of a result log and print what differs; returns the exit code. about, stated: of that run."""
+    from flow.cli.debugging.result_input import graph_of, input_of
+    from recordings.scoring.result_log import end_of_run, input_beside, names_of
+
+    result: Path = options.result
     end = end_of_run(result)
     if end.get("interrupted") == "True" or "drops.dropped" in end:
         why = "dropped frames" if "drops.dropped" in end else "was interrupted"
         raise UsageError(f"the run of {result} {why}, so it cannot be repeated; only the file was checked")
     with TemporaryDirectory(prefix="roverflow-") as folder:
         again = options.out or Path(folder) / "again.mcap"
-        logs, notes = _input(result, options.log)
-        _run_again(result, logs, about, again, options.workers, with_inputs=bool(found.keys() - stated.keys()))
-        differing = _differing(stated, _digests(again)) if again.exists() else sorted(stated)
-    if differing:
-        keep = f"roverflow diff {result} {again}" if options.out else "-o AGAIN.mcap keeps the second result"
-        notes += [f"different in a second run: {', '.join(differing)}", _versions(about), keep]
-    else:
-        notes.append(f"{topics} the same in a second run of {names_of(logs)}")
-    say("\n".join(notes))
-    return DIFFERENT if changed or differing else COMPLETE
+        with input_of(graph_of(result), result, options.log) as (_, notes):
+            logs = options.log or input_beside(result)
+        summary = _run_again(result, logs, about, again, options.workers)
+        if summary["interrupted"]:
+            say("interrupted: the second run was not compared")
+            return INTERRUPTED
+        written = str(again) in summary["outputs"]
+        differing = _differing(stated, _digests(again, stated, about) if written else {})
+    if not differing:
+        say("\n".join([*notes, f"{topics} the same in a second run of {names_of(logs)}"]))
+        return COMPLETE
+    keep = f"roverflow diff {result} {again}" if options.out else "-o AGAIN.mcap keeps the second result"
+    say("\n".join([*notes, f"different in a second run: {', '.join(differing)}", _versions(about), keep]))
+    return DIFFERENT
 
 
-def _input(result: Path, given: list[Path] | None) -> tuple[list[Path], list[str]]:
-    """The files of the input of a result log, and notes about them. given: by the user."""
-    from flow.cli.debugging.result_input import graph_of, input_of
-    from recordings.scoring.result_log import input_beside
-
-    with input_of(graph_of(result), result, given) as (_, notes):
-        return given or input_beside(result), notes
-
-
-def _run_again(
-    result: Path, logs: list[Path], about: Mapping[str, str], out: Path, workers: int, with_inputs: bool
-) -> None:
-    """Repeat the run of a result log. about: its facts."""
+def _run_again(result: Path, logs: list[Path], about: Mapping[str, str], out: Path, workers: int) -> dict[str, Any]:
+    """Repeat the run of a result log; returns the summary. about: the facts of the run."""
     from flow.cli.debugging.result_input import pipeline_of_run
     from recordings.scoring.result_log import pipeline_of
 
     start, end = (float(about[name]) if about.get(name) else None for name in ("start", "end"))
-    with pipeline_of_run(about, pipeline_of(result)) as pipeline:
-        replay(
+    with pipeline_of_run(about, result, pipeline_of(result)) as pipeline:
+        return replay(
             logs, pipeline, out, None, overrides=about["overrides"].splitlines(), start=start, end=end,
             every=every(about["every"]) if about.get("every") else None, profile=about.get("profile"),
-            with_inputs=with_inputs, workers=workers,
+            with_inputs="with_inputs" in about, workers=workers,
         )  # fmt: skip
 
 
-def _digests(result: Path) -> dict[str, str]:
-    """The digests of the topics of a log; raises LogError if it is damaged."""
+def _digests(log: Path, stated: Mapping[str, str], about: Mapping[str, str]) -> dict[str, str]:
+    """The digests of the topics of a log, without those of copied inputs; raises LogError if it is damaged."""
     from mcap.exceptions import McapError
 
     from recordings.errors import LogError
     from recordings.mcap.digests import digests_of
 
+    copies = "with_inputs" in about
     try:
-        return digests_of(result)
+        found = digests_of(log, copies)
     except (McapError, ValueError) as error:
-        raise LogError(f"{result} is damaged: {error}; run its log again") from error
+        raise LogError(f"{log} is damaged: {error}; run its log again") from error
+    return {topic: digest for topic, digest in found.items() if topic in stated or not copies}
 
 
 def _differing(stated: Mapping[str, str], found: Mapping[str, str]) -> list[str]:
-    return [topic for topic in sorted(stated) if found.get(topic) != stated[topic]]
+    return sorted({topic for topic, _ in stated.items() ^ found.items()})
 
 
 def _versions(about: Mapping[str, str]) -> str:
     """How the versions of the run differ from those of today."""
-    changed = [f"{name} {about.get(name)}, now {now}" for name, now in versions().items() if about.get(name) != now]
+    changed = [f"{name} {about[name]}, now {now}" for name, now in versions().items() if about.get(name, now) != now]
     return f"versions of its run: {'; '.join(changed)}" if changed else "the versions are those of its run"

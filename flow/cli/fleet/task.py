@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.fleet.jobs import Job
-from flow.cli.replay import product_version, replay
+from flow.cli.replay import LIBRARIES, product_version, replay
 from flow.cli.report import by_cause
 from flow.config.loader import load, shipped
 from flow.config.templates import SHIPPED
@@ -27,7 +27,6 @@ from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
 
 MAX_FILE_BYTES = 4 << 20  # of a file beside a pipeline that travels with it
-LIBRARIES = ("numpy", "opencv-python-headless", "numba", "scikit-image", "scipy")  # that decide the bits of a result
 _TRAVELLED = f"roverflow-{os.getuid()}-"  # begins the names of folders of pipelines that travelled
 
 
