@@ -36,14 +36,18 @@ def test_a_time_as_the_viewer_shows_it_is_that_of_the_frame(traverse, stamps, sh
                 assert [item.stamp for _, stream, item in cut.events(("left",)) if stream == "left"] == [stamp]
 
 
+@pytest.mark.parametrize("joined", [False, True])
 @pytest.mark.parametrize("delay", [0.02, 0.3, 0.7])
-def test_the_frame_of_a_stamp_is_read_however_late_the_log_has_it(traverse, stamps, tmp_path, delay):
+def test_the_frame_of_a_stamp_is_read_however_late_the_log_has_it(traverse, stamps, tmp_path, delay, joined):
+    """joined: whether the log begins with an image."""
+
     def late(row):
         topic, encoding, schema, log_time, data = row
         return topic, encoding, schema, log_time + round(delay * 1e9) * ("stereo" in topic), data
 
     rows = sorted(map(late, mcap_rows(traverse)), key=itemgetter(3))
-    log = write_mcap(tmp_path / "late.mcap", rows)
+    begin = next(log_time for topic, _, _, log_time, _ in rows if "stereo" in topic) if joined else 0
+    log = write_mcap(tmp_path / "late.mcap", [row for row in rows if row[3] >= begin or "static" in row[0]])
     with McapSource().open(log) as opened:
         for number, stamp in enumerate(stamps):
             part = part_of(opened, np.datetime64(stamp, "ns"), 1, min(number, 1))
@@ -55,7 +59,9 @@ def test_the_frame_of_a_stamp_is_read_however_late_the_log_has_it(traverse, stam
 def test_a_time_of_day_is_that_of_stamps_also_where_they_are_of_another_clock(tmp_path):
     with McapSource().open(write_sample(tmp_path / "log.mcap", changed(LEFT, {"header.stamp.sec": 7}))) as log:
         for shown in ("00:00:07.2", "1970-01-01 00:00:07.2", "7200000000 ns", "0.2"):
-            assert part_of(log, instant(shown), 1, 0).stamp == 7_200_000_000
+            part = part_of(log, instant(shown), 1, 0)
+            assert part.stamp == 7_200_000_000
+            assert (part.start, part.end) == pytest.approx((0.15, 0.25), abs=1e-4)
 
 
 def test_other_times_are_refused(traverse, tmp_path, capsys, refused):

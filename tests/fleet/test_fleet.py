@@ -212,9 +212,10 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
     with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix\.mcap, which .*which\.txt names"):
         jobs_of([str(logs / "which.txt")], tmp_path)
     (logs / "which.txt").write_text("more.txt\n")
-    (logs / "more.txt").write_text("a.mcap\n*.txt\n")
-    with pytest.raises(UsageError, match=r"the text file .*more\.txt names itself; take it out of its lines"):
-        jobs_of([str(logs / "which.txt")], tmp_path)
+    for again in ("*.txt", f"../{logs.name}/which.txt"):
+        (logs / "more.txt").write_text(f"a.mcap\n{again}\n")
+        with pytest.raises(UsageError, match=r"the text file .*\.txt names itself; take it out of its lines"):
+            jobs_of([str(logs / "which.txt")], tmp_path)
 
 
 def test_results_of_logs_above_the_working_folder_stay_in_the_folder_of_the_fleet(logs, tmp_path, monkeypatch):

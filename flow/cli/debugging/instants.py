@@ -74,7 +74,7 @@ def chosen_frame(log: McapLog, times: NDArray[np.int64], at: Instant) -> int:
 def edges_of(log: McapLog, times: NDArray[np.int64]) -> list[float]:
     """Where the part of a log begins that contains each left image, and where the last part ends, s."""
     edges = np.concatenate([times[:1] - MARGIN, (times[1:] + times[:-1]) // 2, times[-1:] + MARGIN])
-    return [max(0, edge - log.begin) / 1e9 for edge in edges.tolist()]
+    return [(edge - log.begin) / 1e9 for edge in edges.tolist()]  # stamps may precede the log's first message
 
 
 def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
@@ -85,7 +85,7 @@ def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
     lost = [entry for entry in summary["ledger"] if entry["stamp"] == part.stamp]
     details = ("" if entry["reason"] == LossReason.UNMATCHED else f" ({entry['detail']})" for entry in lost)
     losses = [f": {entry['stream']} {entry['reason']}{detail}" for entry, detail in zip(lost, details, strict=True)]
-    begin = f"roverflow run --start {part.first:.3f} says why"
+    begin = f"roverflow run --start {max(0, part.first):.3f} says why"
     return UsageError(f"no frame was completed at {part.at:.3f} s{''.join(losses[:1])}; {begin}")
 
 

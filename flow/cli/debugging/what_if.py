@@ -101,7 +101,7 @@ def run_variants(
     if not through:
         raise no_frame(part, summary)
     if through < part.frames:
-        says_why = f"roverflow run --start {part.first:.3f} --end {part.end:.3f} says why"
+        says_why = f"roverflow run --start {max(0, part.first):.3f} --end {part.end:.3f} says why"
         notes.append(f"note: {counted(part.frames - through, 'frame')} gave no result; {says_why}")
     return paths, variants, replace(part, frames=through), notes
 

@@ -87,10 +87,10 @@ def _logs(word: str, folder: Path, lists: tuple[Path, ...] = ()) -> Iterable[Pat
             lines = path.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"{path} is neither a log nor a text file of logs") from error
-        if path.absolute() in lists:
+        if path.resolve() in lists:
             raise UsageError(f"the text file {path} names itself; take it out of its lines")
         for line in filter(None, (line.partition("#")[0].strip() for line in lines)):
-            yield from _logs(str(path.parent / line), folder, (*lists, path.absolute()))
+            yield from _logs(str(path.parent / line), folder, (*lists, path.resolve()))
     elif path.is_file():
         yield path
     else:
