@@ -84,13 +84,11 @@ class PoseCheck:
                 f"{np.median(visual):.2f} m, difference {usual:.2f} m ({len(difference)} steps). Check its frame, its "
                 "heading and its unit, or set source.odometry to visual: visual odometry then supplies the pose."
             )
-        if stretches := self._wrong_stretches():
-            return stretches
         jumps = difference[(difference > MIN_JUMP) & (difference > MIN_JUMP_RATIO * usual)]
         if len(jumps):
             times = counted(len(jumps), "time")
             return f"Logged odometry jumps {times} relative to visual odometry, by up to {jumps.max():.1f} m."
-        return ""
+        return self._wrong_stretches()
 
     def _wrong_stretches(self) -> str:
         """What is wrong with parts of the drive."""
@@ -105,8 +103,8 @@ class PoseCheck:
         ours, theirs = (f"{first[at]:.1f} m and {np.degrees(first[at + 3]):.0f}" for at in (0, 1))
         return (
             f"Logged odometry disagrees with visual odometry in {count} of {len(found)} stretches of the drive, first "
-            f"with {theirs} degrees against {ours} by the images. Check its heading, or set source.odometry to visual: "
-            "visual odometry then supplies the pose."
+            f"with {theirs} degrees against {ours} by the images. Check its heading and whether wheels slipped, or set "
+            "source.odometry to visual: visual odometry then supplies the pose."
         )
 
 

@@ -124,7 +124,7 @@ def _pairs(earlier: VoFrame, later: VoFrame) -> tuple[Array, Array]:
 
 
 def _gain(earlier: VoFrame, later: VoFrame, here: Array, there: Array) -> float:
-    """How much brighter the later image is, by the median of pairs of features."""
+    """Brightness of the later image over that of the earlier one, the median of pairs of features."""
     before, after = (
         frame.gray[tuple(np.rint(frame.pixels[which]).astype(int).T[::-1])].astype(np.float64)
         for frame, which in ((earlier, here), (later, there))
@@ -137,7 +137,7 @@ def _tracked_step(
 ) -> Step | None:
     """The pose fitted to patches of the earlier image, tracked from their positions predicted by the given pose.
 
-    gain: by how much the later image is brighter.
+    gain: brightness of the later image over that of the earlier one.
     """
     points, start, guess = _predicted(earlier, later, matrix, turn, shift)
     if len(points) < MIN_FEATURES:

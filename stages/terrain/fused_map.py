@@ -49,7 +49,7 @@ class FusedMap:
     def reset(self, frame_id: str, stamp: int) -> None:
         """Start an empty map."""
         self.frame_id, self.epoch, self.cells = frame_id, stamp, Tiles(CELL)
-        self.levelling, self.logged, self.up_sum = None, None, np.zeros(3)
+        self.levelling, self.logged, self.up_sum, self.planar = None, None, np.zeros(3), True
 
     def age(self, stamp: int) -> int:
         """Time since the epoch, ms."""

@@ -224,7 +224,9 @@ def test_no_step_leads_over_lost_tracking():
     (lambda number, pose: replace(pose, quaternion=level_turn(1.3 * bend(number))), ""),  # as skid steering states it
     (lambda number, pose: replace(pose, position=pose.position - [0.21 * np.clip(number - 8, 0, 10), 0, 0]),
      "in 2 of 7 stretches of the drive, first with 0.0 m and 0 degrees against 1.0 m and 0 by the"),
-], ids=["right", "no heading", "turns too far", "stuck"])  # fmt: skip
+    (lambda number, pose: replace(pose, position=pose.position + np.array([20.0 * (6 < number < 12), 0, 0])),
+     "jumps 2 times relative to visual odometry, by up to 20.0 m"),
+], ids=["right", "no heading", "turns too far", "stuck", "there and back"])  # fmt: skip
 def test_a_pose_that_is_wrong_in_a_part_of_the_drive_is_a_warning(wrong, problem):
     """The rover drives straight for 20 frames and then turns by 7 degrees in each of 10. Most steps are right."""
     check, place = PoseCheck(), np.zeros(3)

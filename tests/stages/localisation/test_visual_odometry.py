@@ -200,6 +200,13 @@ def test_a_motion_that_is_long_or_rough_is_not_plausible(rms, metres, plausible)
     assert _plausible(step) == plausible
 
 
+def test_a_motion_that_is_not_plausible_is_stated(drive, monkeypatch):
+    far = Step(np.eye(3), np.array([0.0, 0.0, 7.5]), 100, 1.2, 1.0, np.eye(6))
+    monkeypatch.setattr("stages.localisation.visual_odometry.step_between", lambda before, now: far)
+    _, (_, motion) = tracked(*drive[:2])
+    assert motion.lost == "the motion found, 7.5 m with errors of 1.2 px, is not plausible; segment 2 begins"
+
+
 @pytest.mark.parametrize(("flow", "shared", "features", "replaced"), [
     (2.9, 51, 40, False), (3.1, 51, 40, True), (2.9, 49, 40, True), (3.1, 49, 39, False),
 ])  # fmt: skip

@@ -142,15 +142,22 @@ def test_a_pose_in_a_frame_that_leans_is_a_warning(degrees, warned):
         assert found.severity == "warning"
 
 
-def test_a_pose_without_roll_and_pitch_may_drive_on_a_slope():
-    frames = ((cloud, leant(pose, 12)) for cloud, pose in map(drive, range(4)))
-    fuse, _ = fused((cloud, replace(pose, quaternion=level(pose))) for cloud, pose in frames)
+@pytest.mark.parametrize("restarts", [False, True])
+def test_a_pose_without_roll_and_pitch_may_drive_on_a_slope(restarts):
+    """restarts: the frame of the pose is another one before, in which the pose had a roll."""
+    frames = [sloping(*drive(frame)) for frame in range(1, 4)]
+    before, pose = drive(0)
+    first = (before, replace(leant(pose, 12), frame_id="map")) if restarts else sloping(before, pose)
+    fuse, _ = fused([first, *frames])
     assert fuse.finding() is None
 
 
-def level(pose):
-    """Its quaternion with the heading alone."""
-    return Rotation.from_euler("z", Rotation.from_quat(pose.quaternion).as_euler("ZYX")[0]).as_quat()
+def sloping(cloud, pose):
+    """A cloud whose camera is tilted, with a pose that only has a heading."""
+    slope = Rotation.from_euler("x", 12, degrees=True).as_matrix()
+    heading = Rotation.from_euler("z", Rotation.from_quat(pose.quaternion).as_euler("ZYX")[0]).as_quat()
+    sensor = replace(cloud.sensor, rotation=slope @ cloud.sensor.rotation)
+    return replace(cloud, sensor=sensor), replace(pose, quaternion=heading)
 
 
 def test_a_refused_frame_does_not_count_as_leaning():
