@@ -38,12 +38,14 @@ def measures(schema: str, one: Any, other: Any) -> Measures:
 def on_one_grid(one: GridLayers, other: GridLayers) -> tuple[GridLayers, GridLayers] | None:
     """The layers that two grids share, float32, on the smallest grid that contains both, with the smaller cells.
 
-    Cells outside are NaN. None if the grid would have more than `MAX_CELLS`, as where one is far from the other.
+    Cells outside are NaN. None where one grid is far from the other: if the common one would have more than `MAX_CELLS`
+    and four times as many as both.
     """
     step = min(one.resolution, other.resolution)
     low = np.minimum(one.origin, other.origin)
     high = np.maximum(*(np.add(grid.origin, np.multiply(_shape(grid)[::-1], grid.resolution)) for grid in (one, other)))
-    if ((high - low) / step).prod() > MAX_CELLS:
+    extents = [np.multiply(_shape(grid), grid.resolution / step).prod() for grid in (one, other)]
+    if ((high - low) / step).prod() > max(MAX_CELLS, 4 * sum(extents)):
         return None
     columns, rows = (np.arange(round(length)) for length in (high - low) / step)
 

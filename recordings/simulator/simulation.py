@@ -165,7 +165,9 @@ class Simulation:
         if self.relief_cells < 64 or self.relief_cells & (self.relief_cells - 1):
             raise ValueError(f"Simulation.relief_cells must be a power of two of at least 64, not {self.relief_cells}")
         if (tile := self.relief_cells * self.relief_resolution) <= MIN_TILE:
-            raise ValueError(f"Simulation.relief_cells must be a ground of over {MIN_TILE:g} m, not of {tile:g} m")
+            raise ValueError(
+                f"Simulation.relief_cells x relief_resolution must be above {MIN_TILE:g} m, not {tile:g} m"
+            )
 
     def _ground_left(self) -> float:
         """Share of the ground that the set shares leave."""

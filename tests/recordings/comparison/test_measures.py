@@ -52,6 +52,11 @@ def test_maps_far_apart_are_of_another_place():
     cells = near.layers["elevation"].size
     far = replace(near, origin=(near.origin[0] + 2e4, near.origin[1] - 2e4))
     assert measures("grid_map_msgs/msg/GridMap", grid_map(near), grid_map(far)) == {"cells of another place": cells}
+    wide = np.zeros((2100, 2100), np.float32)
+    changed = wide.copy()
+    changed[7, 7] = 1.0
+    pair = (grid_map(replace(near, layers={"elevation": layer})) for layer in (wide, changed))
+    assert measures("grid_map_msgs/msg/GridMap", *pair)["cells"] == 1
     verdicts = scene()["navigation_map"]
     pair = occupancy_grid(verdicts), occupancy_grid(replace(verdicts, origin=(2e4, 2e4)))
     assert measures("nav_msgs/msg/OccupancyGrid", *pair) == {"cells of another place": verdicts.cells.size}

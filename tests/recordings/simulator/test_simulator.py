@@ -370,7 +370,7 @@ def test_an_impossible_simulation_is_refused_with_the_parameters_name(name, valu
 
 
 def test_ground_of_a_tile_smaller_than_its_waves_is_refused():
-    with pytest.raises(ValueError, match=r"relief_cells must be a ground of over 2 m, not of 1\.28 m"):
+    with pytest.raises(ValueError, match=r"relief_cells x relief_resolution must be above 2 m, not 1\.28 m"):
         Simulation(relief_cells=64, relief_resolution=0.02)
 
 
