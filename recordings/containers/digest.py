@@ -9,6 +9,11 @@ from pathlib import Path
 SAMPLE_BYTES = 1 << 20  # at the beginning and at the end of a file
 
 
+def digests_of(files: Iterable[Path]) -> list[str]:
+    """A line for each file: its digest and its name. Raises OSError for a file that cannot be read."""
+    return [f"{log_digest([file])} {file}" for file in files]
+
+
 def log_digest(files: Iterable[Path]) -> str:
     """Hexadecimal digest of the size, beginning and end of each file of a log; names do not count.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from flow.parameters import Checked, check_parameters, parameter
@@ -89,6 +90,12 @@ class LogSettings:
         unit="Hz", low=1,
     )  # fmt: skip
     base_frame: str = parameter("base_link", "the rover's frame")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that the settings name: calibrations and joints."""
+        calibration = (self.calibration,) if isinstance(self.calibration, str) else self.calibration or ()
+        return tuple(map(Path, filter(None, (*calibration, self.joints))))
 
     def __post_init__(self) -> None:
         check_parameters(self)

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from mcap.reader import make_reader
 
 from flow.cli import replay
 from flow.cli.debugging import verify
+from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import MessageKind, Ros2Writer
 from tests.conftest import SMALL, chunks_of, edit_of, mcap_rows, rewrite, roverflow, with_broken
 
@@ -128,11 +130,40 @@ def test_another_input_gives_other_results_and_the_versions_are_named(short, tra
     assert note == f"note: {other} has other bytes than the input of {result}, but the same stamps"
     assert different.startswith("different in a second run: /nav/")
     assert "/nav/disparity, " in different
-    assert versions.startswith("versions of its run: ")
+    assert versions.startswith("since its run: ")
     assert f"numpy {np.__version__}, now 0.0.0" in versions
     assert remedy == f"roverflow diff {result} {again}"
     said(3, "diff", result, again)
     assert said(3, *words).out.endswith("-o AGAIN.mcap keeps the second result\n")
+
+
+def test_a_calibration_that_changed_since_is_named(traverse, tmp_path, said):
+    log, info = tmp_path / "log.mcap", tmp_path / "right.yaml"
+    shutil.copy(traverse, log)
+    files = calibrations_of(traverse, tmp_path)
+    out, change = tmp_path / "out.mcap", f"source.calibration=[{','.join(map(str, files))}]"
+    assert roverflow("run", log, "-p", "fast", *SMALL, "--set", change, "--end", "1.2", "-o", out, "--no-rrd") == 0
+    assert "the same in a second run" in said(0, "verify", out).out
+    content = yaml.safe_load(info.read_text())
+    content["projection_matrix"]["data"][3] *= 1.2
+    info.write_text(yaml.safe_dump(content))
+    lines = said(3, "verify", out).out.splitlines()
+    assert f"since its run: {info} has other content" in lines
+
+
+def calibrations_of(log, folder):
+    """Files of ROS of the two cameras."""
+    files = []
+    for side in ("left", "right"):
+        _, _, info = next(iter_decoded(log, [f"/stereo/{side}/camera_info"]))
+        matrices = {"camera_matrix": (3, 3, info.k), "distortion_coefficients": (1, len(info.d), info.d),
+                    "rectification_matrix": (3, 3, info.r), "projection_matrix": (3, 4, info.p)}  # fmt: skip
+        content = {"image_width": info.width, "image_height": info.height, "camera_name": side,
+                   "distortion_model": info.distortion_model}  # fmt: skip
+        content |= {name: {"rows": r, "cols": c, "data": list(map(float, m))} for name, (r, c, m) in matrices.items()}
+        files.append(folder / f"{side}.yaml")
+        files[-1].write_text(yaml.safe_dump(content, sort_keys=False))
+    return files
 
 
 def test_what_cannot_be_verified_is_refused_in_a_sentence(short, traverse, refused, tmp_path):

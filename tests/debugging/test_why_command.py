@@ -3,6 +3,7 @@
 import re
 import shutil
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -165,19 +166,21 @@ def test_an_unsure_cell_says_what_keeps_it_from_being_free(traverse, fast_result
     assert not why(fast_result, AT, cell=(x, y), log=traverse).doubts
 
 
-def test_a_stage_of_ones_own_is_found_in_the_working_folder(traverse, tmp_path, monkeypatch, refused):
+def test_a_stage_of_ones_own_is_found_here_and_beside_the_result(traverse, tmp_path, monkeypatch, refused):
     (tmp_path / "own_stage.py").write_text(OWN_STAGE)
     (tmp_path / "own.yaml").write_text(OWN_PIPELINE)
     out, path = tmp_path / "own-nav.mcap", [*sys.path]
     assert roverflow("run", traverse, "-p", tmp_path / "own.yaml", "-o", out) == 0
-    for folder, found in ((tmp_path, True), (tmp_path.parent, False)):
+    (tmp_path / "away").mkdir()
+    away = shutil.copy(out, tmp_path / "away")
+    for folder, result, found in ((tmp_path, away, True), (tmp_path.parent, out, True), (tmp_path.parent, away, False)):
         monkeypatch.setattr(sys, "path", [*path])
         monkeypatch.delitem(sys.modules, "own_stage", raising=False)
         monkeypatch.chdir(folder)
         if found:
-            assert "passed" in graph_of(out).kinds
+            assert "passed" in graph_of(Path(result)).kinds
         else:
-            assert "no module 'own_stage'" in (sentence := refused("why", out, "--at", AT, "--cell", "1,1"))
+            assert "no module 'own_stage'" in (sentence := refused("why", result, "--at", AT, "--cell", "1,1"))
             assert "; set PYTHONPATH to its folder\n" in sentence
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import time
 from dataclasses import replace
@@ -208,6 +209,10 @@ def test_logs_are_named_by_files_folders_patterns_and_lists(logs, tmp_path):
     assert names(".") == ["b", "a", "site/c", "junk"]
     with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix"):
         jobs_of([str(logs / "nix")], tmp_path)
+    shutil.copy(logs / "a.mcap", logs / "site #1-nav.mcap")  # no result, although named so
+    (logs / "which.txt").write_text("# the second\nsite #1-nav.mcap # here\n")
+    assert names("which.txt") == ["site #1-nav"]
+    assert "site #1-nav" in names(".")
     (logs / "which.txt").write_text("nix.mcap\n")
     with pytest.raises(UsageError, match=r"no file, folder or pattern .*nix\.mcap, which .*which\.txt names"):
         jobs_of([str(logs / "which.txt")], tmp_path)
@@ -237,13 +242,28 @@ def test_a_row_names_the_faults_and_the_first_loss_of_each_kind():
     assert _columns(summary | {"surveys": {}})["why"] == first
 
 
+def test_a_calibration_that_changed_makes_another_pipeline(tmp_path):
+    for name in ("left.yaml", "right.yaml", "joints.yaml"):
+        (tmp_path / name).write_text("old")
+    changes = (
+        f"source.calibration=[{tmp_path / 'left.yaml'},{tmp_path / 'right.yaml'}]",
+        f"source.joints={tmp_path / 'joints.yaml'}",
+    )
+    digests = {Pipeline.of("fast", changes).digest}
+    for name in ("right.yaml", "joints.yaml"):
+        (tmp_path / name).write_text("new")
+        digests.add(Pipeline.of("fast", changes).digest)
+    assert len(digests) == 3
+    assert Pipeline.of("fast", changes).digest in digests
+
+
 def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs, tmp_path, said, refused):
     (job,) = jobs_of([str(logs / "a.mcap")], tmp_path)
     row = run_task(Task(job, tmp_path, Pipeline.of("fast", ("disparities=48",)), False, workers=2))
     here = {"log": str(job.log), "pipeline": "fast"}
     Catalogue(tmp_path, create=True).put_all({"a": row | here, "junk": here | {"state": "unusable"}})
     for _ in range(2):  # its own file may be replaced
-        assert "no truth: junk" in said(0, "score", tmp_path, "--json", tmp_path / "scores.json").out
+        assert "not scored: junk: no result\n" in said(0, "score", tmp_path, "--json", tmp_path / "scores.json").out
     figures = json.loads((tmp_path / "scores.json").read_text())["pipelines"]["fast"]["a"]
     assert figures["disparity"]["density"] == json.loads(rows_of(tmp_path)["a"]["scores"])["density"]
     listed = json.loads(said(0, "list", tmp_path, "--where", "name = 'a'", "--json").out)

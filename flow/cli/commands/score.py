@@ -49,6 +49,7 @@ def _score_fleet(options: argparse.Namespace) -> int:
     write_text(options.json, json.dumps({"fleet": str(options.result), "pipelines": figures}, indent=2))
     for pipeline, logs in scores.items():
         say(f"{pipeline}\n{as_table([dict(zip(SCORES, row, strict=True)) for row in score_rows(logs)], SCORES)}")
-    if others:
-        say(f"not scored, as they have no result or no truth: {', '.join(others)}")
-    return COMPLETE
+    for name, why in others.items():
+        say(f"not scored: {name}: {why}")
+    damaged = (found for logs in scores.values() for found in logs.values() if found.lost or found.unscored)
+    return INCOMPLETE if any(damaged) else COMPLETE

@@ -111,6 +111,11 @@ def _differing(stated: Mapping[str, str], found: Mapping[str, str]) -> list[str]
 
 
 def _versions(about: Mapping[str, str]) -> str:
-    """How the versions of the run differ from those of today."""
+    """How the versions, and the files that settings name, differ from those of the run."""
+    from recordings.containers.digest import digests_of
+
     changed = [f"{name} {about[name]}, now {now}" for name, now in versions().items() if about.get(name, now) != now]
-    return f"versions of its run: {'; '.join(changed)}" if changed else "the versions are those of its run"
+    for line in about.get("files", "").splitlines():
+        name = line.partition(" ")[2]
+        changed += [] if digests_of([Path(name)]) == [line] else [f"{name} has other content"]
+    return f"since its run: {'; '.join(changed)}" if changed else "the versions are those of its run"

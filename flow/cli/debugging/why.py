@@ -104,7 +104,8 @@ def lines_of(found: Explanation) -> list[str]:
     head = f"cell ({found.x:.3f}, {found.y:.3f}) m at {moment(found.stamp)}: {verdict}, reason {reason}"
     lines = [*found.notes, head]
     if found.recorded is not None and found.recorded != found.verdict:
-        lines.append(f"the result has {found.recorded.name.lower()} here: from earlier frames, or from another version")
+        other = "from earlier frames, another version or another calibration"
+        lines.append(f"the result has {found.recorded.name.lower()} here: {other}")
     return [*lines, *_cell_lines(found), *_pixel_lines(found), *_tilt_lines(found)]
 
 

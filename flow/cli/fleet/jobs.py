@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -14,6 +15,9 @@ from flow.errors import UsageError
 from recordings.containers.digest import log_digest
 from recordings.containers.finding import RESULT_ENDING, SUFFIXES, find_files
 from recordings.errors import LogError
+from recordings.scoring.result_log import about_run
+
+_COMMENT = re.compile(r"(?:^|\s)#(?:\s|$)")  # a name may contain #
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ def _logs(word: str, folder: Path, lists: tuple[Path, ...] = ()) -> Iterable[Pat
             raise UsageError(f"{path} is neither a log nor a text file of logs") from error
         if path.resolve() in lists:
             raise UsageError(f"the text file {path} names itself; take it out of its lines")
-        for line in filter(None, (line.partition("#")[0].strip() for line in lines)):
+        for line in filter(None, (_COMMENT.split(line)[0].strip() for line in lines)):
             yield from _logs(str(path.parent / line), folder, (*lists, path.resolve()))
     elif path.is_file():
         yield path
@@ -116,7 +120,7 @@ def _in_folder(path: Path, folder: Path) -> Iterable[Path]:
             continue
         if item.is_dir():
             yield from _in_folder(item, folder)
-        elif item.suffix in SUFFIXES and not item.stem.endswith(RESULT_ENDING):
+        elif item.suffix in SUFFIXES and not (item.stem.endswith(RESULT_ENDING) and about_run(item)):
             yield item
 
 

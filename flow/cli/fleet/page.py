@@ -32,17 +32,17 @@ def write_fleet_page(path: Path, folder: Path) -> None:
     write_page(path, folder.resolve().name, [about, f"<h2>Logs</h2>{html_table(cells, _COLUMNS)}"])
 
 
-def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], list[str]]:
-    """Pipeline -> log -> score, and the logs without a result or truth; the catalogue keeps the scores."""
-    scores, others = dict[str, dict[str, Score]](), list[str]()
+def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], dict[str, str]]:
+    """Pipeline -> log -> score, and log -> why it has no score; the catalogue keeps the scores."""
+    scores, others = dict[str, dict[str, Score]](), dict[str, str]()
     catalogue = Catalogue(folder, create=(folder / NAME).is_file())
     for row in catalogue.rows():
         try:
             if row["state"] != "done" or row["result"] is None:
                 raise LogError("no result")
             found = score(folder / row["result"], Path(row["log"]))
-        except LogError:  # the log has no truth, or is gone
-            others.append(row["name"])
+        except LogError as error:  # the log has no truth, is gone or damaged
+            others[row["name"]] = str(error)
             continue
         known = {name: value for name, value in zip(SCORES[1:], brief_figures(found), strict=True) if value == value}
         catalogue.put(row["name"], {"scores": known})

@@ -23,6 +23,7 @@ from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, UsageError
 from flow.runtime.findings import lines
+from recordings.containers.digest import digests_of
 from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
 
@@ -37,16 +38,18 @@ class Pipeline:
     name: str
     files: Mapping[str, bytes]
     changes: tuple[str, ...]
+    named: tuple[str, ...] = ()  # digests of the files that settings name
 
     @classmethod
     def of(cls, name: str, changes: tuple[str, ...]) -> Pipeline:
         """The pipeline `name`, which `load` accepts; a file takes the .py files beside it along."""
+        named = tuple(digests_of(getattr(load(name, changes).source, "files", ())))
         if name in shipped():
-            return cls(name, {}, changes)
+            return cls(name, {}, changes, named)
         path = Path(name)
         beside = [path, *sorted(path.parent.glob("*.py"))]
         small = {file.name: file.read_bytes() for file in beside if file.stat().st_size <= MAX_FILE_BYTES}
-        return cls(path.name, small, changes)
+        return cls(path.name, small, changes, named)
 
     @property
     def label(self) -> str:
@@ -60,7 +63,7 @@ class Pipeline:
         if not self.files:
             parts = sorted((SHIPPED / "parts").glob("*.yaml"))
             text = b"".join(file.read_bytes() for file in (SHIPPED / f"{self.name}.yaml", *parts))
-        return hashlib.sha256(text + "\n".join(self.changes).encode()).hexdigest()[:16]
+        return hashlib.sha256(text + "\n".join((*self.changes, *self.named)).encode()).hexdigest()[:16]
 
     def local(self) -> str:
         """Its name or file on this machine."""
