@@ -193,7 +193,7 @@ class McapSink:
         counts = {name: str(summary[name]) for name in _COUNTS if name in summary}
         for group in ("drops", "messages"):
             counts |= {f"{group}.{name}": str(count) for name, count in summary.get(group, {}).items()}
-        for stream, finding in summary.get("findings", {}).items():
+        for stream, finding in found:
             counts[f"findings.{stream}"] = f"{finding['severity']}: {finding['sentence']}"
         writer.metadata("roverflow.run", counts)
         writer.metadata("roverflow.digests", writer.digests())

@@ -11,6 +11,7 @@ from mcap.reader import make_reader
 from recordings import McapSink
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid, read_point_cloud, stamp_of
+from recordings.scoring.result_log import end_of_run
 from stages.data import (
     LEVEL_FRAME,
     Disparity,
@@ -113,6 +114,15 @@ def test_every_result_is_in_the_log_under_its_frame_s_stamp(tmp_path):
     assert (moved.header.frame_id, moved.child_frame_id) == ("level", "left_optical")
     assert moved.transform.translation.z == 0.9
     assert stamp_of(moved.header) == START
+
+
+def test_the_end_of_a_run_contains_what_its_survey_and_its_stages_found(tmp_path):
+    fault = {"severity": "fault", "sentence": "left and right are swapped"}
+    note = {"severity": "note", "sentence": "level"}
+    summary = SUMMARY | {"surveys": {"rectified": fault}, "findings": {"tilt": note}}
+    path = logged(tmp_path / "out.mcap", Record(START, items(START)), summary=summary)
+    found = {name: value for name, value in end_of_run(path).items() if name.startswith("findings.")}
+    assert found == {"findings.rectified": "fault: left and right are swapped", "findings.tilt": "note: level"}
 
 
 def test_losses_are_in_the_diagnostics_of_their_frame_or_at_the_end(tmp_path):
