@@ -7,6 +7,7 @@ compared where both know the ground: a difference of heights beyond their sigmas
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -78,7 +79,7 @@ class Merged:
         """Whether it is a fault, and a sentence, for each pair of logs with conflicts and each log on its own."""
         for (first, second), found in self.overlaps.items():
             if found.conflicts:
-                names = f"{self.logs[first - 1].name} and {self.logs[second - 1].name}"
+                names = f"{self._name_of(first)} and {self._name_of(second)}"
                 x, y = found.place
                 yield (
                     found.conflicts > MAX_CONFLICT_SHARE * found.cells,
@@ -88,9 +89,17 @@ class Merged:
                     ),
                 )
         paired = {number for pair in self.overlaps for number in pair}
-        for number, log in enumerate(self.logs, 1):
+        for number in range(1, len(self.logs) + 1):
             if number not in paired and len(self.logs) > 1:
-                yield False, f"{log.name} has no cell in common with another log"
+                yield False, f"{self._name_of(number)} has no cell in common with another log"
+
+    def _name_of(self, number: int) -> str:
+        """The name of a log; with its folders where several logs have the same one."""
+        places = [log.absolute() for log in self.logs]
+        own = places[number - 1]
+        if len({place.name for place in places}) == len(places):
+            return own.name
+        return str(own.relative_to(os.path.commonpath([place.parent for place in places])))
 
     def as_json(self) -> dict[str, Any]:
         """The content of merge.json."""

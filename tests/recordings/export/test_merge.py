@@ -65,6 +65,11 @@ def test_logs_that_differ_by_more_than_their_sigmas_are_reported(tmp_path, said)
     b = traverse(tmp_path / "b.mcap", 40, 1.2, 1e-4, hazard_col=-1)
     text = said(3, "export", a, b, tmp_path / "out", "--merge").out
     assert "WARNING: a.mcap and b.mcap conflict in 1000 of 1000 common cells: second minus first is +0.200 m" in text
+    for site in ("one", "two"):
+        (tmp_path / site).mkdir()
+    first, second = a.rename(tmp_path / "one/sol.mcap"), b.rename(tmp_path / "two/sol.mcap")
+    text = said(3, "export", first, second, tmp_path / "again", "--merge").out
+    assert "WARNING: one/sol.mcap and two/sol.mcap conflict in 1000 of" in text
     (pair,) = json.loads((tmp_path / "out/merge.json").read_text())["overlaps"]
     assert (pair["logs"], pair["common_cells"], pair["conflicts"]) == ([1, 2], 1000, 1000)
     assert pair["mean_difference_m"] == pytest.approx(0.2, abs=1e-5)
