@@ -37,6 +37,8 @@ MAX_CORRECTION = 1.0  # px; a match farther from its median or plane stays as it
 MIN_INLIER_SHARE, MIN_VALID_SHARE = 0.8, 0.6  # of a superpixel with an accepted plane; a surface needs half the matches
 MAX_GRADIENT = 0.5  # px/px, of an accepted plane
 MIN_SPARSE_SIZE = 64  # px; planes of segments of this mean size are fitted to a quarter of the pixels
+BLACK_LEVEL, BLACK_SIGMAS = 4, 3  # gray levels, and noise at level 0, up to which a shadow is black
+BLACK_WINDOW, BLACK_MARGIN = 5, 3  # px: of the median that is black, and around it
 MAX_EVEN_CONTRAST = 6  # gray levels in a census window: noise and compression of a uniform patch
 MAX_FILL_DISTANCE = 64.0  # px to a disparity that fills a hole; of an occlusion any distance
 MAX_EXTRAPOLATION = 16  # px that holes are filled beyond the last match, at the border or towards the sky
@@ -225,6 +227,7 @@ class Refine(Stage):
         guide, both, noise = frame.once(gray_pair)[0], frame.once(slopes), frame.once(frame_noise)
         floor = SMOOTH_FLOOR if self.bilateral_radius else FLOOR
         found = supported(pixels, guessed, guide, both, noise, floor, self.threads)
+        _doubt_black(found.sigma, guide, noise)
         consistent = found.sigma <= F32(self.max_sigma)
         if self.min_correlation:
             consistent &= found.correlation >= F32(self.min_correlation)
@@ -244,3 +247,14 @@ def _saturated(image: Array, guide: Array, level: int) -> Array:
         return np.zeros(guide.shape, bool)
     bright = image >= level if image.ndim == 2 else cv2.inRange(image, (0,) * 3, (level - 1,) * 3) == 0
     return bright & (contrast(guide, 0, len(guide)) <= MAX_EVEN_CONTRAST) if bright.any() else bright
+
+
+def _doubt_black(sigma: Array, guide: Array, noise: Array) -> None:
+    """Take the evidence, in place, where the image is black: a match there is that of the lit ground around.
+
+    noise: (256,) standard deviation at each gray level.
+    """
+    level = max(BLACK_LEVEL, BLACK_SIGMAS * float(noise[0]))
+    if np.count_nonzero(guide <= level) > BLACK_WINDOW**2 // 2:
+        black = (cv2.medianBlur(guide, BLACK_WINDOW) <= level).view(np.uint8)
+        sigma[cv2.dilate(black, np.ones((2 * BLACK_MARGIN + 1,) * 2, np.uint8)) > 0] = np.inf

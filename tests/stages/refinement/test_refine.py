@@ -273,6 +273,24 @@ def test_matches_of_a_saturated_sky_do_not_count(monkeypatch):
     assert (Refine()(sky, matches).pixels[:40] > 50).all()
 
 
+@pytest.mark.parametrize("level", [4, -1])
+def test_a_black_shadow_is_not_measured_by_the_lit_ground_around_it(monkeypatch, level):
+    """The matches in it are noise near those around; without the limits they become MEASURED."""
+    rng = np.random.default_rng(7)
+    texture = cv2.GaussianBlur(rng.uniform(0, 255, (HEIGHT, WIDTH + 8)).astype(np.float32), (0, 0), 1.5)
+    texture = (100 + 2 * (texture - texture.mean())).astype(np.uint8)
+    left, right = texture[:, :WIDTH].copy(), texture[:, 8:].copy()
+    for image, shift in ((left, 0), (right, 8)):
+        image[40:80, 60 - shift : 100 - shift] = rng.integers(0, 4, (40, 40))
+    monkeypatch.setattr(module, "BLACK_LEVEL", level)
+    monkeypatch.setattr(module, "BLACK_SIGMAS", 3 if level > 0 else -1)
+    source = Refine()(StereoFrame(5, left, right, CAMERA), matched(flat())).source
+    shadow = source[40:80, 60:100]
+    assert (shadow == PixelOrigin.MEASURED).any() == (level < 0)
+    assert (shadow == PixelOrigin.FILLED).all() or level < 0
+    assert (source[:30] == PixelOrigin.MEASURED).mean() > 0.8
+
+
 def test_even_patches_that_are_bright_in_a_colour_are_saturated():
     image = cv2.blur(np.random.default_rng(3).integers(0, 256, (97, 60, 3), dtype=np.uint8), (9, 9))
     image[24:72, 10:] = 253
