@@ -28,6 +28,7 @@ from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_do
 from stages.stage import Stage, check_types, parameter
 
 MAX_ROW_OFFSET = 64.0  # px
+MAX_IMPLIED_COLUMNS = 1.0  # px, of columns that come with the rows
 UNUSUAL_ROW_OFFSET = 8.0  # px, more than a calibration leaves
 MAX_CROSSED_SHARE = 0.5  # of the features, beyond infinity
 MIN_NEGATIVE_SHARE = 0.05  # of the features, with negative disparity; chance makes less than 0.01
@@ -144,6 +145,13 @@ class Rectify(Stage):
             severity = Severity.WARNING
             found += "; so much is unusual: are the images rectified, and with this calibration?"
         sentence = f"{found}; corrected, as row_offset={list(terms)} would"
+        columns = _columns_implied(plain[0].camera, offset.terms)
+        if columns > max(MAX_IMPLIED_COLUMNS, 3 * offset.error):
+            severity = Severity.WARNING
+            sentence += (
+                ". What moves rows so, a turned camera or a wrong focal length, also moves columns by up to "
+                f"{columns:.1f} px, which nothing corrects: heights may be wrong; check the calibration"
+            )
         return replace(self, row_offset=terms), Finding(sentence, severity)
 
     @property
@@ -175,6 +183,13 @@ def _columns_needed(camera: StereoCamera, offset: RowOffset | None) -> int:
     """The columns by which to move the right image to the left: 0 unless enough features have negative disparities."""
     shown = offset is not None and offset.negative >= MIN_NEGATIVE_SHARE and offset.crossed <= MAX_CROSSED_SHARE
     return math.ceil(max(-_infinity(camera), 0.0)) if shown else 0
+
+
+def _columns_implied(camera: StereoCamera, terms: Sequence[float]) -> float:
+    """The largest shift of columns, px, by the rotation and the focal length that move rows by these terms."""
+    _, x, y, xy, _ = (*terms, 0.0, 0.0, 0.0, 0.0)[:5]
+    width, height = camera.width, camera.height
+    return (abs(x) * height / width + abs(y) * width / height) / 2 + abs(xy) * camera.fx**2 / (width * height)
 
 
 def _rectified(frame: StereoFrame, row_terms: tuple[float, ...] = (), columns: int = 0) -> StereoFrame:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stages.data import CameraModel, StereoCamera, StereoFrame
-from stages.rectification.rectify import Rectify, _rectifying_maps
+from stages.rectification.rectify import Rectify, _columns_implied, _rectifying_maps
 from stages.rectification.row_offset import _as_bright, measure, offset_field
 from tests.conftest import slow
 
@@ -234,7 +234,8 @@ def test_a_survey_measures_what_its_frames_have_in_common(rectified):
     stage, found = Rectify().survey(frames)
     assert np.abs(off(stage.row_offset)).max() < 0.1
     assert "of 3 frames" in found.sentence
-    assert found.severity == "note"
+    assert found.severity == "warning"
+    assert "also moves columns by up to 1.2 px, which nothing corrects" in found.sentence
     assert (Rectify().surveys, stage.surveys) == (True, False)
     aligned = stage(frames[0])
     assert measure([(aligned.left, aligned.right)]).largest < 0.1
@@ -247,6 +248,17 @@ SWAPPED = "100% of the features that both images show look farther than infinity
 
 
 @pytest.mark.parametrize("rows", [0.0, 20.0])
+@pytest.mark.parametrize(("terms", "columns"), [
+    ((3.0,), 0.0), ((0.0, 2.0), 0.75), ((0.0, 0.0, -1.8), 1.2), ((0.0, 0.0, 0.0, 1.0), 500**2 / (640 * 480)),
+    ((0.0, 0.0, 0.0, 0.0, 2.0), 0.0),
+])  # fmt: skip
+def test_rows_of_a_turned_camera_or_another_focal_length_come_with_columns(terms, columns):
+    """A focal length that is wrong by 0.75 % moves the first row by 0.9 px, half of 1.8, and the first column by 1.2."""
+    assert _columns_implied(CAMERA, terms) == pytest.approx(columns)
+    _, found = Rectify().survey([StereoFrame(1, *a_pair(terms), CAMERA)])
+    assert (found.severity == "warning") == (columns > 1)
+
+
 def test_a_survey_finds_swapped_images(rows):
     left, right = a_pair((rows,))
     _, found = Rectify().survey([StereoFrame(1, right, left, CAMERA)])
