@@ -253,7 +253,7 @@ SWAPPED = "100% of the features that both images show look farther than infinity
     ((0.0, 0.0, 0.0, 0.0, 2.0), 0.0),
 ])  # fmt: skip
 def test_rows_of_a_turned_camera_or_another_focal_length_come_with_columns(terms, columns):
-    """A focal length that is wrong by 0.75 % moves the first row by 0.9 px, half of 1.8, and the first column by 1.2."""
+    """A focal length that is wrong by 0.75 % moves the first row by 0.9 px and the first column by 1.2 px."""
     assert _columns_implied(CAMERA, terms) == pytest.approx(columns)
     _, found = Rectify().survey([StereoFrame(1, *a_pair(terms), CAMERA)])
     assert (found.severity == "warning") == (columns > 1)
