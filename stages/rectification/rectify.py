@@ -28,7 +28,7 @@ from stages.rectification.row_offset import MODELS, RowOffset, measure, moved_do
 from stages.stage import Stage, check_types, parameter
 
 MAX_ROW_OFFSET = 64.0  # px
-MAX_IMPLIED_COLUMNS = 1.0  # px, of columns that come with the rows
+MAX_IMPLIED_COLUMNS = 0.0045  # of the width, that columns come with the rows; a focal length off by 0.9 % does more
 UNUSUAL_ROW_OFFSET = 8.0  # px, more than a calibration leaves
 MAX_CROSSED_SHARE = 0.5  # of the features, beyond infinity
 MIN_NEGATIVE_SHARE = 0.05  # of the features, with negative disparity; chance makes less than 0.01
@@ -146,7 +146,7 @@ class Rectify(Stage):
             found += "; so much is unusual: are the images rectified, and with this calibration?"
         sentence = f"{found}; corrected, as row_offset={list(terms)} would"
         columns = _columns_implied(plain[0].camera, offset.terms)
-        if columns > max(MAX_IMPLIED_COLUMNS, 3 * offset.error):
+        if columns > MAX_IMPLIED_COLUMNS * plain[0].camera.width:
             severity = Severity.WARNING
             sentence += (
                 ". What moves rows so, a turned camera or a wrong focal length, also moves columns by up to "
