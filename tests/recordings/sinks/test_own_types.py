@@ -118,7 +118,7 @@ def test_a_dataclass_becomes_a_topic_per_field(tmp_path):
         "histogram": "std_msgs/Int64MultiArray", "text": "std_msgs/String", "range_m": "std_msgs/Float64MultiArray",
         "mount": "geometry_msgs/TransformStamped", "disparity": "stereo_msgs/DisparityImage",
         "disparity/source": "sensor_msgs/Image", "disparity/camera_info": "sensor_msgs/CameraInfo",
-        "by_side/_2": "std_msgs/Float64",
+        "by_side/left_eye": "std_msgs/Float64", "by_side/_2": "std_msgs/Float64",
     }  # fmt: skip
     assert read["/nav/own/mask"].header.frame_id == "camera"
     assert read["/nav/own/histogram"].data.tolist() == [0, 1, 2, 3]
