@@ -88,7 +88,7 @@ def _about(
     end: float | None, every: Every | None,
 ) -> dict[str, str]:  # fmt: skip
     """The facts of a run that its outputs contain. logs: as the user gave them; files: of these."""
-    from recordings.containers.digest import digests_of, log_digest
+    from recordings.containers.digest import digest_lines, log_digest
     from recordings.scoring.result_log import names_of
 
     about = {
@@ -96,7 +96,7 @@ def _about(
         "overrides": "\n".join(overrides),
         "log": names_of(logs),
         "log_digest": log_digest(files) if files else "",
-        "files": "\n".join(digests_of(getattr(graph.source, "files", ()))),
+        "files": "\n".join(digest_lines(getattr(graph.source, "files", ()))),
         "start": "" if start is None else repr(float(start)),
         "end": "" if end is None else repr(float(end)),
         "every": "" if every is None else str(every),

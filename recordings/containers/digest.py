@@ -9,7 +9,7 @@ from pathlib import Path
 SAMPLE_BYTES = 1 << 20  # at the beginning and at the end of a file
 
 
-def digests_of(files: Iterable[Path]) -> list[str]:
+def digest_lines(files: Iterable[Path]) -> list[str]:
     """A line for each file: its digest and its name. Raises OSError for a file that cannot be read."""
     return [f"{log_digest([file])} {file}" for file in files]
 

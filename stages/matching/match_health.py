@@ -36,7 +36,7 @@ class CheckMatches(Stage):
         return []
 
     def __call__(self, disparity: Disparity, *, state: list[float]) -> MatchHealth:
-        """The matched shares; that of near ground is of the right half, all of which the right camera sees."""
+        """The matched shares. The near ground is that of the right half, which the right camera sees entirely."""
         check_types(self, disparity=disparity)
         height, width = disparity.pixels.shape
         ground = np.s_[-max(1, round(NEAR_ROWS * height)) :, width // 2 :]

@@ -112,10 +112,10 @@ def _differing(stated: Mapping[str, str], found: Mapping[str, str]) -> list[str]
 
 def _versions(about: Mapping[str, str]) -> str:
     """How the versions, and the files that settings name, differ from those of the run."""
-    from recordings.containers.digest import digests_of
+    from recordings.containers.digest import digest_lines
 
     changed = [f"{name} {about[name]}, now {now}" for name, now in versions().items() if about.get(name, now) != now]
     for line in about.get("files", "").splitlines():
         name = line.partition(" ")[2]
-        changed += [] if digests_of([Path(name)]) == [line] else [f"{name} has other content"]
+        changed += [] if digest_lines([Path(name)]) == [line] else [f"{name} has other content"]
     return f"since its run: {'; '.join(changed)}" if changed else "the versions are those of its run"

@@ -23,7 +23,7 @@ from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, UsageError
 from flow.runtime.findings import lines
-from recordings.containers.digest import digests_of
+from recordings.containers.digest import digest_lines
 from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
 
@@ -43,7 +43,7 @@ class Pipeline:
     @classmethod
     def of(cls, name: str, changes: tuple[str, ...]) -> Pipeline:
         """The pipeline `name`, which `load` accepts; a file takes the .py files beside it along."""
-        named = tuple(digests_of(getattr(load(name, changes).source, "files", ())))
+        named = tuple(digest_lines(getattr(load(name, changes).source, "files", ())))
         if name in shipped():
             return cls(name, {}, changes, named)
         path = Path(name)
