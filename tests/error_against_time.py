@@ -23,9 +23,9 @@ import cv2
 import numpy as np
 
 from flow.config.loader import load
+from flow.malloc import keep_freed_memory
 from flow.runtime.evaluate import evaluate
 from flow.runtime.graph import Graph
-from flow.runtime.malloc import keep_freed_memory
 from recordings.simulator.scenes import SCENES
 from stages.data import Array
 from stages.matching.intensity import gray

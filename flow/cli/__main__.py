@@ -20,7 +20,7 @@ def program() -> int:
             if signal.getsignal(number) is signal.SIG_DFL:
                 signal.signal(number, signal.default_int_handler)  # outputs are then closed or removed
         _open_closed_streams()
-        from flow.runtime.malloc import keep_freed_memory
+        from flow.malloc import keep_freed_memory
 
         keep_freed_memory()
         from flow.cli.main import main

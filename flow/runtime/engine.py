@@ -23,57 +23,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
 
 from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink, Unchanged
 from flow.runtime.bottleneck import READING, bottleneck
 from flow.runtime.graph import Node, start
 from flow.runtime.ledger import Ledger, failure
-
-_NO_ITEM = (Absent, Unchanged)
-
-
-@dataclass(eq=False)
-class _Frame:
-    """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
-    streams that are there or being made; due: when, s; seconds: of its stages and sinks; begun, done: the work
-    on it; served: whether the stages that do not wait for the next frame are through."""
-
-    index: int
-    stamp: int
-    due: float
-    values: dict[str, Any]
-    entries: list[Loss]
-    coming: set[str]
-    seconds: dict[str, float] = field(default_factory=dict)
-    begun: set[_Work] = field(default_factory=set)
-    done: set[_Work] = field(default_factory=set)
-    served: bool = False
-
-
-@dataclass(eq=False)
-class _Work:
-    """A stage, or a sink (`output` is then None).
-
-    inputs: the streams that must be there before it starts; reads: those of them whose items it uses; large: whether it
-    needs much memory; flushes: whether it must know the last frame; consumers: what waits for its output; inbox:
-    indices of frames; next: the frame that an ordered work takes next; seconds, cpu_seconds: its time so far.
-    """
-
-    name: str
-    inputs: tuple[str, ...]
-    reads: tuple[str, ...]
-    output: str | None
-    ordered: bool
-    run: Callable[[_Frame], Any]
-    large: bool = False
-    flushes: bool = False
-    seconds: float = 0.0
-    cpu_seconds: float = 0.0
-    consumers: list[_Work] = field(default_factory=list)
-    inbox: set[int] = field(default_factory=set)
-    next: int = 0
+from flow.runtime.work import NO_ITEM, Frame, Work, missing_of
 
 
 class Engine:
@@ -101,14 +57,14 @@ class Engine:
         lock = threading.RLock()
         self._condition, self._caller = threading.Condition(lock), threading.Condition(lock)  # workers; the caller
         self._fits: Callable[[], bool] = lambda: False  # whether what `admit` waits with has room
-        self._frames: deque[_Frame] = deque()
+        self._frames: deque[Frame] = deque()
         self.states = start(stages) | dict(states or {})  # stream -> state of its stage, of this run
         self._work = [self._stage_work(node) for node in stages]
         self._sink_seconds = dict.fromkeys(sinks, 0.0)  # of the last frame that was through
         self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
         for name, (sink, streams) in sinks.items():
             self._work.append(self._sink_work(name, sink, streams))
-        self._readers: dict[str, list[_Work]] = {}
+        self._readers: dict[str, list[Work]] = {}
         late = set[str | None]()  # streams that wait for the next frame
         for work in self._work:
             work.consumers = [other for other in self._work if work.output in other.inputs]
@@ -146,7 +102,7 @@ class Engine:
         values: stream -> item or Absent, for every stream that no stage makes; due, deadline: s of `time.perf_counter`.
         """
         begun = time.perf_counter()
-        frame = _Frame(self.admitted, stamp, begun if due is None else due, dict(values), list(entries), set(values))
+        frame = Frame(self.admitted, stamp, begun if due is None else due, dict(values), list(entries), set(values))
         frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
@@ -258,7 +214,7 @@ class Engine:
             with self._reporting, suppress(Exception):
                 self._on_frame(complete)
 
-    def _next_task(self) -> tuple[_Work, _Frame] | None:
+    def _next_task(self) -> tuple[Work, Frame] | None:
         """The most downstream work that is ready and has room for its result, on the oldest frame possible."""
         if self._closed or self.failure:
             return None
@@ -270,7 +226,7 @@ class Engine:
                         return work, frame
         return None
 
-    def _begin(self, work: _Work, frame: _Frame) -> None:
+    def _begin(self, work: Work, frame: Frame) -> None:
         frame.begun.add(work)
         work.inbox.discard(frame.index)
         self._in_large += work.large
@@ -280,26 +236,26 @@ class Engine:
         else:
             self._writing += 1
 
-    def _ready(self, work: _Work, frame: _Frame) -> bool:
+    def _ready(self, work: Work, frame: Frame) -> bool:
         if frame.index not in work.inbox or (work.ordered and frame.index != work.next):
             return False
         if work.flushes and frame is self._frames[-1] and not self._ending:
             return False
         return all(stream in frame.values for stream in work.inputs)
 
-    def _has_room(self, consumers: Iterable[_Work], frame: _Frame) -> bool:
+    def _has_room(self, consumers: Iterable[Work], frame: Frame) -> bool:
         """Whether the inboxes of all `consumers` have room for `frame`; the oldest frame always has right of way."""
         if not self._frames or frame is self._frames[0]:
             return True
         return all(len(c.inbox) < self._capacity + c.flushes or frame.index in c.inbox for c in consumers)
 
-    def _expect(self, frame: _Frame, nodes: Iterable[_Work]) -> None:
+    def _expect(self, frame: Frame, nodes: Iterable[Work]) -> None:
         """Put `frame` into the inboxes of those nodes whose inputs are all there or being made."""
         for work in nodes:
             if work not in frame.begun and frame.coming.issuperset(work.inputs):
                 work.inbox.add(frame.index)
 
-    def _deliver(self, work: _Work, frame: _Frame, value: Any) -> list[bool]:
+    def _deliver(self, work: Work, frame: Frame, value: Any) -> list[bool]:
         """Store the result of a work; returns for each frame that is now through whether it is complete."""
         if isinstance(value, BaseException):
             if work.output is None:
@@ -311,11 +267,11 @@ class Engine:
         if work.output:
             frame.values[work.output] = value
         self._complete(work, frame)
-        if isinstance(value, _NO_ITEM):
+        if isinstance(value, NO_ITEM):
             self._pass_absence(frame)
         return list(self._retire())
 
-    def _complete(self, work: _Work, frame: _Frame) -> None:
+    def _complete(self, work: Work, frame: Frame) -> None:
         frame.done.add(work)
         if not frame.served and frame.done.issuperset(self._prompt):
             frame.served = True
@@ -324,19 +280,19 @@ class Engine:
         while work.ordered and any(f.index == work.next and work in f.done for f in self._frames):
             work.next += 1
 
-    def _free(self, frame: _Frame, streams: Iterable[str]) -> None:
+    def _free(self, frame: Frame, streams: Iterable[str]) -> None:
         """Let go of the items that no work on the frame will read any more. What marks a missing item stays."""
         for stream in streams:
             unread = frame.done.issuperset(self._readers.get(stream, ()))
-            if unread and stream in frame.values and not isinstance(frame.values[stream], _NO_ITEM):
+            if unread and stream in frame.values and not isinstance(frame.values[stream], NO_ITEM):
                 frame.values[stream] = None
 
-    def _pass_absence(self, frame: _Frame) -> None:
+    def _pass_absence(self, frame: Frame) -> None:
         """Make the output of every stage with an absent input absent, unless it flushes (in topological order)."""
         for work in self._work:
             if work.output is None or work.flushes or work in frame.begun:
                 continue
-            missing = _missing(frame.values.get(stream) for stream in work.inputs)
+            missing = missing_of(frame.values.get(stream) for stream in work.inputs)
             if missing:
                 frame.begun.add(work)
                 work.inbox.discard(frame.index)
@@ -357,13 +313,13 @@ class Engine:
 
     # -- the work itself, outside the lock -------------------------------------------------------------------
 
-    def _stage_work(self, node: Node) -> _Work:
+    def _stage_work(self, node: Node) -> Work:
         state = {"state": self.states[node.name]} if node.stateful else {}
         streams, flushes = tuple(node.inputs.values()), hasattr(node.actor, "flush")
 
-        def run(frame: _Frame) -> Any:
+        def run(frame: Frame) -> Any:
             given = {port: frame.values[stream] for port, stream in node.inputs.items()}
-            missing = _missing(given.values())
+            missing = missing_of(given.values())
             value = None if missing else node.actor(**given, **state)
             if value is None and flushes and self._ending and frame is self._frames[-1]:
                 value = node.actor.flush(**state)
@@ -373,15 +329,15 @@ class Engine:
             return value
 
         large = bool(getattr(node.actor, "large", False))
-        return _Work(node.name, streams, streams, node.name, node.stateful, run, large=large, flushes=flushes)
+        return Work(node.name, streams, streams, node.name, node.stateful, run, large=large, flushes=flushes)
 
-    def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> _Work:
+    def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> Work:
         stages = [work for work in self._work if work.output]
         order = {work.name: index for index, work in enumerate(self._work)}
 
-        def run(frame: _Frame) -> None:
+        def run(frame: Frame) -> None:
             values = {stream: frame.values[stream] for stream in streams}
-            items = {stream: value for stream, value in values.items() if not isinstance(value, _NO_ITEM)}
+            items = {stream: value for stream, value in values.items() if not isinstance(value, NO_ITEM)}
             unchanged = frozenset(stream for stream, value in values.items() if isinstance(value, Unchanged))
             entries = tuple(sorted(frame.entries, key=lambda entry: (order.get(entry.stage, -1), entry.stamp)))
             with self._condition:
@@ -391,10 +347,4 @@ class Engine:
 
         # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
         every = tuple(dict.fromkeys([*streams, *(work.name for work in stages)]))
-        return _Work(name, every, tuple(streams), None, True, run)
-
-
-def _missing(values: Iterable[Any]) -> Absent | Unchanged | None:
-    """What stands for the first lost item among these, else for the first unchanged one; None if all are there."""
-    found = [value for value in values if isinstance(value, _NO_ITEM)]
-    return next((value for value in found if isinstance(value, Absent)), found[0] if found else None)
+        return Work(name, every, tuple(streams), None, True, run)

@@ -21,7 +21,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from flow.runtime.malloc import keep_freed_memory
+from flow.malloc import keep_freed_memory
 from recordings.simulator import Simulation
 from stages import Disparity, Match, MatchOpenCV, Rectify, Refine, StereoCamera, StereoFrame
 from stages.data import Array

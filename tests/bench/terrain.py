@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from flow.align import Token
 from flow.cli import arguments
-from flow.runtime.malloc import keep_freed_memory
+from flow.malloc import keep_freed_memory
 from recordings.scoring.table import ROWS, terrain_figures, terrain_lines
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
 from recordings.simulator import ground_truth, traverse

@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flow.runtime.malloc import keep_freed_memory
+from flow.malloc import keep_freed_memory
 from recordings.scoring.stereo_metrics import SURFACES, StereoErrors
 from recordings.simulator import Simulation
 from recordings.simulator.scenes import SCENES

@@ -7,8 +7,8 @@ import pytest
 
 from flow.cli.debugging.logged_state import logged_state
 from flow.cli.debugging.result_input import graph_of
+from flow.cli.debugging.variants import merged
 from flow.cli.debugging.what_if import run_variants
-from flow.runtime.variants import merged
 from recordings.results import read_result
 from stages import FuseRegion
 from tests.conftest import SMALL, an_hour_later, edit_of, rewrite, roverflow, slow

@@ -16,9 +16,9 @@ import numpy as np
 
 from flow.cli.debugging.regional_explanation import level_in
 from flow.cli.debugging.result_input import check_input
+from flow.cli.debugging.variants import Variants, sink_of
 from flow.errors import UsageError
 from flow.runtime.graph import Graph, Node
-from flow.runtime.variants import Variants, sink_of
 from recordings.comparison.text import moment
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.from_msg import pose_of, read_grid_map

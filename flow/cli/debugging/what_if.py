@@ -10,13 +10,13 @@ from typing import Any
 from flow.cli.debugging.instants import Instant, Part, no_frame, part_of
 from flow.cli.debugging.logged_state import resume
 from flow.cli.debugging.result_input import graph_of
+from flow.cli.debugging.variants import Variants, VariantSink, merged, sink_of
 from flow.cli.replay import ARROW_EXTRA, RESULT_TYPES, one_thread_per_call, product_version
 from flow.config.loader import load
 from flow.contracts import counted
 from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import fitted, run
-from flow.runtime.variants import Variants, VariantSink, merged, sink_of
 from recordings.scoring.result_log import names_of, stamps_of
 
 MAX_VARIANTS = 26  # one letter each
