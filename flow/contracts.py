@@ -180,7 +180,9 @@ class Sink(Protocol):
     - `asks`: parameter -> value that the run gives to the stages that have the parameter at its default, so that they
       make more for this sink; no other result may change by it;
     - `discard()`: gives up the output and keeps an existing file, where no frame got through or another output failed;
-    - `empty`: whether there is nothing worth keeping; the run then calls `discard`.
+    - `empty`: whether there is nothing worth keeping; the run then calls `discard`;
+    - `checkpoint()`, `resume(saved)`: returns what a later run of the same output needs to go on behind the last frame,
+      and goes on from it, after `open`; without them `run --resume` refuses the pipeline.
     """
 
     suffix: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -36,12 +37,13 @@ def replay(
     profile: str | None = None,
     desk: str | None = None,
     with_inputs: bool = False,
+    resume: bool = False,
 ) -> dict[str, Any]:
     """Run a log through a pipeline into a result log and, unless None, a rerun recording; returns the summary.
 
     Parameters
     ----------
-    log, pipeline, out, rrd, overrides, workers, start, end, rate, profile, desk, with_inputs
+    log, pipeline, out, rrd, overrides, workers, start, end, rate, profile, desk, with_inputs, resume
         As of `roverflow run`; `overrides` has the texts of --set.
     every
         2 for every second frame, or `flow.runtime.frame_selection.Every(metres=0.5)`.
@@ -55,6 +57,7 @@ def replay(
     >>> replay("traverse.mcap", "rover", "nav.mcap", None, overrides=["disparities=128"])["verdict"]  # doctest: +SKIP
     'COMPLETE'
     """
+    from flow.cli.checkpoint_file import CheckpointFile, remove_checkpoint
     from flow.config import loader as pipelines
     from flow.runtime.interrupts import Stop, interrupts
     from flow.runtime.run import run
@@ -79,7 +82,13 @@ def replay(
         hidden = on_frame is not None or not sys.stderr.isatty()
         with _progress_bar(_frames(opened.frames, every), hidden) as (advance, say), interrupts(stop, say):
             settings: dict[str, Any] = {"workers": workers, "every": every, "rate": rate}
+            if resume:
+                recording = os.path.relpath(rrd, Path(out).parent) if rrd is not None else ""
+                facts = about | {"outputs": repr((recording, profile, desk, with_inputs))}
+                settings["checkpoints"] = CheckpointFile(Path(out), facts, say)
             summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
+    if not (resume and summary["interrupted"]):
+        remove_checkpoint(Path(out))
     return as_json(summary | {"overrides": list(overrides)})
 
 

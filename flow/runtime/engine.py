@@ -18,6 +18,7 @@ A stage may return None, where nothing is new; then `Unchanged` passes through e
 from __future__ import annotations
 
 import math
+import pickle
 import threading
 import time
 from collections import deque
@@ -27,6 +28,7 @@ from typing import Any
 
 from flow.contracts import Absent, FrameRecord, Loss, LossReason, Sink, Unchanged
 from flow.runtime.bottleneck import READING, bottleneck
+from flow.runtime.checkpoint import Checkpoint
 from flow.runtime.graph import Node, start
 from flow.runtime.ledger import Ledger, failure
 from flow.runtime.work import NO_ITEM, Frame, Work, missing_of
@@ -38,7 +40,7 @@ class Engine:
     stages: in topological order; sinks: name -> (sink, the streams it gets); ledger: gets an entry for every loss;
     workers: threads; capacity: frames that an inbox holds, and one more where a stage flushes; max_frames: in flight,
     at least 2 if a stage flushes; on_frame: called after every frame, with whether it lost nothing; states: stream ->
-    state that its stage begins with in place of a new one.
+    state that its stage begins with in place of a new one; resumed: the checkpoint that the run goes on from.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Engine:
         max_frames: int = 1024,
         on_frame: Callable[[bool], None] = lambda complete: None,
         states: Mapping[str, Any] | None = None,
+        resumed: Checkpoint | None = None,
     ) -> None:
         self._ledger, self._on_frame = ledger, on_frame
         self._capacity, self._max_large = capacity, max(1, workers // 2)
@@ -59,6 +62,8 @@ class Engine:
         self._fits: Callable[[], bool] = lambda: False  # whether what `admit` waits with has room
         self._frames: deque[Frame] = deque()
         self.states = start(stages) | dict(states or {})  # stream -> state of its stage, of this run
+        self.states |= {name: resumed.state(name) for name in self.states} if resumed is not None else {}
+        self.checkpoint: Checkpoint | None = None  # the last one that every stage and sink is through
         self._work = [self._stage_work(node) for node in stages]
         self._sink_seconds = dict.fromkeys(sinks, 0.0)  # of the last frame that was through
         self._max_frames = max(max_frames, 2) if any(work.flushes for work in self._work) else max_frames
@@ -77,7 +82,9 @@ class Engine:
         self._in_large = 0  # workers inside a large stage
         self._reporting = threading.Lock()
         self.failure: tuple[str, BaseException] | None = None
-        self.admitted = self.through = self.complete = 0
+        self.admitted = self.through = self.complete = self.resumed = 0
+        if resumed is not None:
+            self._resume(resumed)
         self.late_entries: list[Loss] = []  # losses of the frames that did not get through
         self.latencies: list[float] = []  # s, from when a frame was due until its stages were through
         self.waiting = 0.0  # s that `admit` waited for room
@@ -88,6 +95,15 @@ class Engine:
         for thread in self._threads:
             thread.start()
 
+    def _resume(self, checkpoint: Checkpoint) -> None:
+        """Begin behind the frames before a checkpoint."""
+        self.admitted = self.through = self.resumed = checkpoint.frames
+        self.complete = checkpoint.complete
+        for loss in checkpoint.losses:
+            self._ledger.add(loss)
+        for work in self._work:
+            work.next = checkpoint.frames
+
     def admit(
         self,
         stamp: int,
@@ -96,14 +112,17 @@ class Engine:
         stop: Callable[[], bool] = lambda: False,
         due: float | None = None,
         deadline: float = math.inf,
+        save: bool = False,
     ) -> bool:
         """Take in a frame as soon as there is room; False if the engine fails, `stop()` is true or the deadline passes.
 
-        values: stream -> item or Absent, for every stream that no stage makes; due, deadline: s of `time.perf_counter`.
+        values: stream -> item or Absent, for every stream that no stage makes; due, deadline: s of `time.perf_counter`;
+        save: whether a checkpoint follows the frame.
         """
         begun = time.perf_counter()
         frame = Frame(self.admitted, stamp, begun if due is None else due, dict(values), list(entries), set(values))
         frame.entries += [value.cause for value in values.values() if isinstance(value, Absent)]
+        frame.saved = {} if save else None
         with self._condition:
             first = [work for work in self._work if all(stream in frame.values for stream in work.inputs)]
             self._fits = lambda: len(self._frames) < self._max_frames and self._has_room(first, frame)
@@ -168,7 +187,7 @@ class Engine:
         """What limits the rate of the run, on this number of cores (`flow.runtime.bottleneck`)."""
         sinks = [work.name for work in self._work if work.output is None]
         serial = {work.name: work.seconds for work in self._work if work.ordered} | {READING: self.reading}
-        return bottleneck(self.seconds, sinks, serial, len(self._threads), self.through, cores)
+        return bottleneck(self.seconds, sinks, serial, len(self._threads), self.through - self.resumed, cores)
 
     # -- scheduling: everything below, up to the work itself, runs under the lock --------------------------------
 
@@ -277,8 +296,11 @@ class Engine:
             frame.served = True
             self.latencies.append(time.perf_counter() - frame.due)
         self._free(frame, work.reads if work.output is None else (*work.reads, work.output))
-        while work.ordered and any(f.index == work.next and work in f.done for f in self._frames):
-            work.next += 1
+        for other in self._frames if work.ordered else ():
+            if other.index == work.next and work in other.done:
+                if other.saved is not None:
+                    other.saved[work.name] = pickle.dumps(work.state())
+                work.next += 1
 
     def _free(self, frame: Frame, streams: Iterable[str]) -> None:
         """Let go of the items that no work on the frame will read any more. What marks a missing item stays."""
@@ -309,6 +331,11 @@ class Engine:
             self._sink_seconds = {name: frame.seconds[name] for name in self._sink_seconds}
             self.through += 1
             self.complete += complete
+            if frame.saved is not None:
+                names = {work.name for work in self._work}
+                entries = (entry for entry in self._ledger.entries if entry.stage in names)
+                losses = tuple(entry for entry in entries if entry.stamp <= frame.stamp)
+                self.checkpoint = Checkpoint(self.through, self.complete, frame.saved, losses)
             yield complete
 
     # -- the work itself, outside the lock -------------------------------------------------------------------
@@ -322,14 +349,16 @@ class Engine:
             missing = missing_of(given.values())
             value = None if missing else node.actor(**given, **state)
             if value is None and flushes and self._ending and frame is self._frames[-1]:
-                value = node.actor.flush(**state)
+                value, frame.saved = node.actor.flush(**state), None  # its state is not that of a run that goes on
             if value is None and (missing or node.sparse):
                 return missing or Unchanged()
             node.check(value, given.values(), frame.stamp)
             return value
 
         large = bool(getattr(node.actor, "large", False))
-        return Work(node.name, streams, streams, node.name, node.stateful, run, large=large, flushes=flushes)
+        return Work(
+            node.name, streams, streams, node.name, node.stateful, run, lambda: self.states[node.name], large, flushes
+        )
 
     def _sink_work(self, name: str, sink: Sink, streams: Sequence[str]) -> Work:
         stages = [work for work in self._work if work.output]
@@ -347,4 +376,4 @@ class Engine:
 
         # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
         every = tuple(dict.fromkeys([*streams, *(work.name for work in stages)]))
-        return Work(name, every, tuple(streams), None, True, run)
+        return Work(name, every, tuple(streams), None, True, run, getattr(sink, "checkpoint", lambda: None))

@@ -9,15 +9,17 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from flow.contracts import MAX_WORKERS, Event, Finding, Log, Sink, Verdict
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.bottleneck import latency, usable_cores
+from flow.runtime.checkpoint import Checkpoint, Checkpoints, check_resumable
 from flow.runtime.engine import Engine
 from flow.runtime.findings import as_dicts, findings, has_fault, warning
-from flow.runtime.frame_assembler import FrameAssembler
+from flow.runtime.frame_assembler import FrameAssembler, ReadyFrame
 from flow.runtime.frame_selection import Every, FrameSelection
 from flow.runtime.graph import Graph
 from flow.runtime.interrupts import Stop
@@ -47,16 +49,18 @@ class _Outputs:
             raise UsageError(f"{use} writes none of the streams {', '.join(dict(kinds))}; {naming}leave it out")
         return cls({use: (sink, wanted[use]) for use, sink in sinks.items()}, paths)
 
-    def open(self, kinds: Mapping[str, type], about: Mapping[str, str]) -> bool:
-        """Open all sinks; False if one fails, and then none stays open."""
+    def open(self, kinds: Mapping[str, type], about: Mapping[str, str], resumed: Checkpoint | None) -> bool:
+        """Open all sinks, to begin or to go on from a checkpoint; False if one fails, and then none stays open."""
         for use, (sink, streams) in self.sinks.items():
             try:
                 sink.open(self.paths[use], {stream: kinds[stream] for stream in streams}, about)
+                self.opened.append(use)
+                if resumed is not None:
+                    cast(Any, sink).resume(resumed.state(use))
             except Exception as error:
                 self.errors.append((use, error))
                 self.discard()
                 return False
-            self.opened.append(use)
         return True
 
     def discard(self, only_empty: bool = False) -> None:
@@ -106,6 +110,7 @@ def run(
     stop: Stop | None = None,
     on_frame: Callable[[bool], None] = lambda complete: None,
     states: Mapping[str, Any] | None = None,
+    checkpoints: Checkpoints | None = None,
 ) -> dict[str, Any]:
     """Run an opened log through a graph, and return the summary.
 
@@ -135,6 +140,8 @@ def run(
         Called after every frame, with whether all of its streams are there.
     states
         Stream -> state that its stage begins with in place of a new one.
+    checkpoints
+        Where to keep checkpoints, and the one to go on from. Default: none are made.
 
     Returns
     -------
@@ -145,7 +152,8 @@ def run(
     Raises
     ------
     UsageError
-        The log lacks a stream that the graph or `every` needs, or there is no worker.
+        The log lacks a stream that the graph or `every` needs, there is no worker, or a stage or sink has no
+        checkpoint.
     SinkError
         An output could not be written. All outputs are closed by then.
     """
@@ -161,19 +169,23 @@ def run(
         prepared = prepass(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
     graph = prepared.graph
     sinks = _Outputs.of(graph, outputs)
+    resumed = checkpoints.last if checkpoints is not None else None
+    if checkpoints is not None:
+        check_resumable(graph.stages, {use: sink for use, (sink, _) in sinks.sinks.items()})
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
-    engine = Engine(
-        graph.stages, sinks.sinks, ledger, workers=workers, max_frames=workers + 1, on_frame=on_frame, states=states
-    )
+    limits = {"workers": workers, "max_frames": workers + 1}
+    engine = Engine(graph.stages, sinks.sinks, ledger, **limits, on_frame=on_frame, states=states, resumed=resumed)
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
         fixed = "\n".join(f"{name}={json.dumps(value)}" for name, value in prepared.fixed.items())
         facts = {**(about or {}), "surveys": surveys, "fixed": fixed}
-        if not stop.finishing() and sinks.open(graph.frame_streams, facts):
+        if not stop.finishing() and sinks.open(graph.frame_streams, facts, resumed):
             started = time.perf_counter() - wall
-            at_end = _feed(assembler, _read(log.events(assembler.wanted), stop), engine, stop, Pace(rate))
+            events = _read(log.events(assembler.wanted), stop)
+            at_end = _feed(assembler.frames(events), assembler, engine, stop, Pace(rate), checkpoints)
     finally:
         engine.finish(stop.abandoning)
+        _keep(engine, checkpoints)
         sinks.errors += [engine.failure] if engine.failure else []
         times = {"wall_seconds": time.perf_counter() - wall, "start_seconds": started}
         times |= {"cpu_seconds": time.process_time() - cpu, "survey_cpu_seconds": prepared.cpu_seconds}
@@ -250,16 +262,23 @@ class _StoppedError(Exception):
     """Ends the reading of a log before its end, so that aligners do not treat the place as the end of the log."""
 
 
-def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, stop: Stop, pace: Pace) -> bool:
+def _feed(
+    frames: Iterator[ReadyFrame], assembler: FrameAssembler, engine: Engine, stop: Stop, pace: Pace,
+    checkpoints: Checkpoints | None,
+) -> bool:  # fmt: skip
     """Admit the frames of the log; False if the run was stopped, or an output failed, before the end of the log."""
     begun, paused = time.perf_counter(), 0.0
     try:
-        for frame in assembler.frames(events):
+        for _ in islice(frames, engine.through):  # before the checkpoint
+            engine.report([True])
+        for frame in frames:
             came = time.perf_counter()
             pace.wait(frame.stamp, stop.finishing)
             paused += time.perf_counter() - came
+            _keep(engine, checkpoints)
+            save = checkpoints is not None and checkpoints.due()
             given = frame.stamp, frame.values, frame.entries
-            if not stop.finishing() and engine.admit(*given, stop.finishing, pace.due, pace.deadline):
+            if not stop.finishing() and engine.admit(*given, stop.finishing, pace.due, pace.deadline, save):
                 continue
             if engine.failure or stop.finishing():
                 assembler.give_back(frame)
@@ -271,6 +290,13 @@ def _feed(assembler: FrameAssembler, events: Iterable[Event], engine: Engine, st
         return False
     finally:
         engine.reading = time.perf_counter() - begun - engine.waiting - paused
+
+
+def _keep(engine: Engine, checkpoints: Checkpoints | None) -> None:
+    """Keep the engine's last checkpoint."""
+    made = engine.checkpoint
+    if checkpoints is not None and made is not None and made is not checkpoints.last:
+        checkpoints.keep(made)
 
 
 def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
@@ -311,6 +337,7 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "frames_in": engine.admitted,
         "frames_out": engine.complete,
         "frames_through": engine.through,  # with and without losses
+        "frames_resumed": engine.resumed,  # of them, those before the checkpoint that the run went on from
         "drops": ledger.counts(),
         "messages": dict(sorted(assembler.messages.items())),
         "seconds": {name: round(value, 6) for name, value in engine.seconds.items()},
@@ -319,7 +346,7 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "latency_seconds": latency(engine.latencies),
         "bottleneck": engine.bottleneck(usable_cores()),
         **{name: round(value, 6) for name, value in times.items()},
-        "frames_per_second": round(engine.through / times["wall_seconds"], 4),
+        "frames_per_second": round((engine.through - engine.resumed) / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
         "entries": [*engine.late_entries, *assembler.late_entries],

@@ -15,7 +15,8 @@ NO_ITEM = (Absent, Unchanged)
 class Frame:
     """A frame in flight. values: stream -> item, Absent, Unchanged, or None where the item was freed; coming: its
     streams that are there or being made; due: when, s; seconds: of its stages and sinks; begun, done: the work on it;
-    served: whether the stages that do not wait for the next frame are through."""
+    served: whether the stages that do not wait for the next frame are through; saved: stage or sink -> its state after
+    this frame, pickled, None where no checkpoint follows it."""
 
     index: int
     stamp: int
@@ -27,6 +28,7 @@ class Frame:
     begun: set[Work] = field(default_factory=set)
     done: set[Work] = field(default_factory=set)
     served: bool = False
+    saved: dict[str, bytes] | None = None
 
 
 @dataclass(eq=False)
@@ -35,7 +37,8 @@ class Work:
 
     inputs: the streams that must be there before it starts; reads: those of them whose items it uses; large: whether it
     needs much memory; flushes: whether it must know the last frame; consumers: what waits for its output; inbox:
-    indices of frames; next: the frame that an ordered work takes next; seconds, cpu_seconds: its time so far.
+    indices of frames; next: the frame that an ordered work takes next; seconds, cpu_seconds: its time so far; state: of
+    an ordered work, to be saved.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Work:
     output: str | None
     ordered: bool
     run: Callable[[Frame], Any]
+    state: Callable[[], Any] = lambda: None
     large: bool = False
     flushes: bool = False
     seconds: float = 0.0

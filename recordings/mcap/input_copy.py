@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from recordings.containers.container import Channel, LostMessage, RawMessage
+from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.opening import open_recording
 from recordings.containers.time_range import TimeRange
 from recordings.discovery.roles import TRANSFORMS
 from recordings.encodings.decoding import decoder_of
 from recordings.errors import LogError
-from recordings.mcap.writer import MIN_OWN_CHUNK_BYTES, MessageKind, Ros2Writer
+from recordings.mcap.writer import MIN_OWN_CHUNK_BYTES, Ros2Writer, kind_of
 from recordings.ros2.from_msg import frame_name
 
 OWN_FRAME = "nav/"  # before the name of a camera in the results' tree, if the input has a transform to it
@@ -35,7 +35,7 @@ def copy_inputs(
         part = TimeRange.after(log.start, start, end)
         static = {number for number, channel in log.channels.items() if channel.topic.endswith("tf_static")}
         ranges = [(static, None, None), (set(log.channels) - static, part.low, part.high)]
-        kinds = {number: _kind(channel) for number, channel in log.channels.items()}
+        kinds = {number: kind_of(channel) for number, channel in log.channels.items()}
 
         def add(messages: Sequence[RawMessage]) -> None:
             for message in messages:
@@ -73,10 +73,3 @@ def parents_in(logs: Sequence[Path]) -> dict[str, str]:
                 found = [] if isinstance(item, LostMessage) else decoders[item.channel](item.data).transforms
                 parents |= {frame_name(each.child_frame_id): frame_name(each.header.frame_id) for each in found}
     return parents
-
-
-def _kind(channel: Channel) -> MessageKind:
-    schema = channel.schema
-    if schema is None:
-        return MessageKind("", channel.message_encoding, "", b"")
-    return MessageKind(schema.name, channel.message_encoding, schema.encoding, schema.text)

@@ -6,6 +6,7 @@ images. The log gets its name when it is complete.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ from mcap.writer import CompressionType, Writer
 
 from flow.contracts import counted
 from recordings.atomic_write import give_name, temporary_name, unwritable, writing
+from recordings.containers.container import Channel, RawMessage
 from recordings.errors import LogError
 from recordings.mcap.digests import Digests
 from recordings.mcap.file import McapFile
@@ -51,6 +53,14 @@ class MessageKind(NamedTuple):
     text: bytes
 
 
+class Written(NamedTuple):
+    """What a log contains at some moment. partials: the temporary names of the log, and of those that it continues;
+    counts: topic -> number of messages, without copied ones."""
+
+    partials: tuple[str, ...]
+    counts: dict[str, int]
+
+
 class Ros2Writer:
     """Writes messages as `ros2msg` / CDR, with log time = publish time = stamp. Same calls, same bytes.
 
@@ -70,6 +80,7 @@ class Ros2Writer:
         self._counts: dict[int, int] = {}
         self._digests = Digests() if digests else None
         self._partial = self._temporary_name()
+        self._continued: tuple[str, ...] = ()  # temporary names of logs that this one continues
         with writing(self.path):
             self._file = self._open()
         self._writer: Any = Writer(self._file, chunk_size=1024 * 1024, compression=COMPRESSIONS[compression])
@@ -103,6 +114,31 @@ class Ros2Writer:
             if large:
                 self._writer.flush()
 
+    def written(self) -> Written:
+        """What the log contains. All of it is in the file by now."""
+        with self._reporting():
+            self._writer.flush()
+        own = {topic: number for (topic, copy_of), (number, _) in self._channels.items() if copy_of is None}
+        counts = {topic: self._counts[number] for topic, number in own.items()}
+        return Written((self._partial.name, *self._continued), counts)
+
+    def continue_from(self, before: Written) -> None:
+        """Copy what a log contained that is unfinished, or has got its name. Raises LogError if it is not all there."""
+        self._continued, left = before.partials, Counter(before.counts)
+        partial = self.path.with_name(before.partials[0])
+        path = partial if partial.exists() else self.path
+        with suppress(LogError), McapFile(path) as log:
+            own = {min(log.channels_of([topic]), default=-1) for topic in before.counts}
+            for item in log.messages(own):
+                if isinstance(item, RawMessage) and left[(channel := log.channels[item.channel]).topic]:
+                    left[channel.topic] -= 1
+                    self.add(channel.topic, kind_of(channel), item.log_time, item.data)
+                if not left.total():
+                    return
+        if left.total():
+            missing = counted(left.total(), "message")
+            raise LogError(f"{path} lacks {missing} of the run that is to be resumed; run without --resume")
+
     def digests(self) -> dict[str, str]:
         """Topic -> digest of its messages so far, without copied ones."""
         return self._digests.by_topic() if self._digests is not None else {}
@@ -128,6 +164,8 @@ class Ros2Writer:
             self._file.flush()
             give_name(self._partial, self.path)
             self._file.close()
+            for earlier in self._continued:
+                self.path.with_name(earlier).unlink(missing_ok=True)
 
     def abort(self) -> None:
         """Discard the log; an earlier file at `path` stays. After `close`, does nothing."""
@@ -192,3 +230,11 @@ class Ros2Writer:
         if not held:
             self._partial.unlink(missing_ok=True)
         return f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""
+
+
+def kind_of(channel: Channel) -> MessageKind:
+    """The type of a channel's messages."""
+    schema = channel.schema
+    if schema is None:
+        return MessageKind("", channel.message_encoding, "", b"")
+    return MessageKind(schema.name, channel.message_encoding, schema.encoding, schema.text)

@@ -54,6 +54,7 @@ MAX_UNIT_CHARS = 3  # of a unit that stands at each value of a scale; a longer o
 CLEARED = components_of(rr.Clear(recursive=False))
 (NUMBER,) = (one.descriptor for one in components_of(rr.Scalars(0.0)))
 LINE_SPACING = 2  # m, between the lines across a map
+_OF_ONE_RECORDING = ("recording", "rows", "numbers", "_recurred")
 HEADROOM = 0.35  # above the first row of a legend, share of the height of a row
 
 
@@ -91,6 +92,10 @@ class Canvas:
 
     def __post_init__(self) -> None:
         self.rows, self.numbers = EntityRows(self.recording), EntityRows(self.recording)
+
+    def remembered(self) -> dict[str, Any]:
+        """What the canvas remembers of the frames so far. What recurs is logged once more."""
+        return {name: value for name, value in vars(self).items() if name not in _OF_ONE_RECORDING}
 
     def log(self, path: str, archetype: Any, *views: ViewSpec) -> None:
         """Log an entity at the frame's time; views: where the blueprint shows it."""

@@ -17,7 +17,7 @@ from flow.contracts import FrameRecord, Loss
 from flow.parameters import check_parameters, parameter, set_by_run
 from recordings.errors import LogError
 from recordings.mcap.input_copy import copy_inputs, parents_in
-from recordings.mcap.writer import COMPRESSIONS, Ros2Writer
+from recordings.mcap.writer import COMPRESSIONS, Ros2Writer, Written
 from recordings.ros2.plain import message_of
 from recordings.ros2.to_msg import (
     diagnostics,
@@ -51,6 +51,7 @@ from stages.data import (
 
 _KNOWN = (Disparity, PointCloud, ElevationMap, NavigationMap, Pose, Transform)
 _OK, _WARN, _ERROR = 0, 1, 2  # levels of diagnostic_msgs/DiagnosticStatus
+_REMEMBERED = ("_owners", "_rooted", "_last_stamp", "empty")
 _COUNTS = ("verdict", "interrupted", "pipeline", "frames_in", "frames_out")
 
 
@@ -176,6 +177,17 @@ class McapSink:
         statuses = [*_statuses(record.entries), *health, *epochs]
         writer.write("/nav/diagnostics", diagnostics(stamp, statuses), stamp)
         self._last_stamp = stamp
+
+    def checkpoint(self) -> tuple[Written, dict[str, Any]]:
+        """What the log contains by now, and what the sink remembers of it."""
+        return self._writer.written(), {name: getattr(self, name) for name in _REMEMBERED}
+
+    def resume(self, saved: tuple[Written, dict[str, Any]]) -> None:
+        """Continue the log of a checkpoint, after `open`. Raises LogError if its messages are not all there."""
+        written, remembered = saved
+        self._writer.continue_from(written)
+        for name, value in remembered.items():
+            setattr(self, name, value)
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the log. summary: of the run: losses after the last frame ("entries"), verdict and counts."""

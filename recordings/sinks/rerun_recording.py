@@ -6,17 +6,20 @@ errors by default; here they are raised.
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 from flow.contracts import FrameRecord, Loss, counted
 from recordings.atomic_write import give_name, room_to_grow, temporary_name, unwritable, writing
+from recordings.errors import LogError
 from recordings.follower import Follower
 from recordings.sinks.blueprint import (
     APPLICATION,
@@ -45,6 +48,8 @@ PLOT_BATCH, LIVE_BATCH = 32, 4  # frames whose numbers are sent at once, without
 BATCH_SECONDS = 3600.0  # batches end by their size, not by the clock
 LEVELS = {"warning": rr.TextLogLevel.WARN, "fault": rr.TextLogLevel.ERROR}  # of findings; INFO for others
 STEPS = rr.components.InterpolationMode.StepAfter  # how queue depths are drawn
+COPIED_BYTES = 1 << 24  # at once
+_REMEMBERED = ("_stamp", "_frames", "_work", "_interval", "_rest", "_drawn")
 FOOTER_MAGIC = b"RRF2FOOT"  # at the end of a whole recording, before a checksum of 4 bytes
 
 
@@ -57,6 +62,16 @@ def check_room(partial: Path, path: Path) -> None:
         raise unwritable(path, f"less than {RESERVED_BYTES >> 20} MB more can be written there")
 
 
+class Saved(NamedTuple):
+    """A recording at a checkpoint. partials: its temporary name, and those of the recordings that it continues; size:
+    bytes of the file; remembered, canvas: attributes of the recording and of its canvas."""
+
+    partials: tuple[str, ...]
+    size: int
+    remembered: dict[str, Any]
+    canvas: dict[str, Any]
+
+
 class RerunRecording:
     """A recording that is being written.
 
@@ -67,6 +82,7 @@ class RerunRecording:
     def __init__(self, settings: Any, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         self._settings, self._path, self._streams, self._about = settings, Path(path), tuple(streams), dict(about)
         self._partial = temporary_name(self._path)
+        self._continued: tuple[str, ...] = ()  # temporary names of recordings that this one continues
         self._viewer: Follower | None = None
         self._stamp = 0  # the latest, ns
         self._frames, self._views = 0, -1
@@ -133,6 +149,33 @@ class RerunRecording:
                 self._viewer.grown()
         self._frames += 1
 
+    def checkpoint(self) -> Saved:
+        """What the recording contains. All of it is in the file by now."""
+        self._canvas.rows.send()
+        self._canvas.numbers.send()
+        self._recording.flush()
+        remembered = {name: getattr(self, name) for name in _REMEMBERED}
+        partials = (self._partial.name, *self._continued)
+        return Saved(partials, self._partial.stat().st_size, remembered, self._canvas.remembered())
+
+    def resume(self, saved: Saved) -> None:
+        """Copy what a recording contained that is unfinished, or has got its name. Raises LogError if it is cut."""
+        partial = self._path.with_name(saved.partials[0])
+        source = partial if partial.exists() else self._path
+        part = temporary_name(self._path)
+        try:
+            if _copy_start(source, part, saved.size) < saved.size:
+                raise LogError(f"{source} lacks a part of the run that is to be resumed; run without --resume")
+            with catch_and_log_exceptions(strict=True), warnings.catch_warnings(action="ignore"):  # it has no end
+                chunks = rr.chunk.RrdReader(str(part)).stream()
+                self._recording.send_chunks(chunk for chunk in chunks if not chunk.entity_path.startswith("/__"))
+                self._recording.flush()
+        finally:
+            part.unlink(missing_ok=True)
+        self._continued = saved.partials
+        vars(self).update(saved.remembered)
+        vars(self._canvas).update(saved.canvas)
+
     def close(self, summary: Mapping[str, Any]) -> None:
         """End the recording with the run's verdict and give it its name."""
         try:
@@ -196,6 +239,8 @@ class RerunRecording:
         if not whole:
             raise OSError("its end is missing, as after a full disk")
         give_name(self._partial, self._path)
+        for name in self._continued:
+            self._path.with_name(name).unlink(missing_ok=True)
 
     def _choose_pictures(self, items: Mapping[str, Any]) -> None:
         """Decide whether this frame's images, clouds and surfaces are drawn, and which streams are no intermediates.
@@ -259,6 +304,15 @@ class RerunRecording:
     def _layout(self) -> Layout:
         slowest = [stage for stage, _ in self._work.most_common(MAX_LEGEND_LINES)]
         return Layout(tuple(self._canvas.views.values()), tuple(slowest))
+
+
+def _copy_start(source: Path, copy: Path, size: int) -> int:
+    """Copy the first bytes of a file, none of a file that does not exist; returns their number."""
+    copied = 0
+    with writing(copy), suppress(FileNotFoundError), source.open("rb") as file, copy.open("wb") as target:
+        while copied < size and (block := file.read(min(COPIED_BYTES, size - copied))):
+            copied += target.write(block)
+    return copied
 
 
 @cache

@@ -22,7 +22,7 @@ from recordings.sinks.own_types import NUMBERS, plain_type
 from stages.data import Mount, Region
 
 if TYPE_CHECKING:
-    from recordings.sinks.rerun_recording import RerunRecording
+    from recordings.sinks.rerun_recording import RerunRecording, Saved
 
 
 @dataclass(eq=False)
@@ -92,6 +92,18 @@ class RerunSink(Checked):
         if self._recording is None:
             raise LogError("RerunSink is not open")
         self._recording.write(record)
+
+    def checkpoint(self) -> Saved:
+        """What the recording contains by now."""
+        if self._recording is None:
+            raise LogError("RerunSink is not open")
+        return self._recording.checkpoint()
+
+    def resume(self, saved: Saved) -> None:
+        """Continue the recording of a checkpoint, after `open`. Raises LogError if it is not all there."""
+        if self._recording is None:
+            raise LogError("RerunSink is not open")
+        self._recording.resume(saved)
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """End the recording with the run's verdict and give it its name. Does nothing if none is open."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.arguments import every, rate, seconds, workers
+from flow.cli.checkpoint_file import checkpoint_of
 from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
@@ -58,6 +59,11 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
         help="replay at R times the pace of the log and drop the frames that find no free worker, as on the vehicle "
         "(as fast as possible, no frame dropped)",
     )
+    sub.add_argument(
+        "--resume",
+        action="store_true",
+        help="make checkpoints, and go on from the last one of a run of this command that was stopped or killed",
+    )
     sub.add_argument("--workers", type=workers, default=os.cpu_count() or 1, metavar="N", help="threads (all cores)")
     sub.add_argument("--summary", type=Path, metavar="OUT.json", help="write counts, losses, times and verdict as JSON")
 
@@ -74,7 +80,9 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve or options.desk):
         raise UsageError("--view, --serve and --desk need the recording; leave out --no-rrd")
-    names = ("workers", "start", "end", "every", "rate", "profile", "desk", "with_inputs")
+    if options.resume and options.rate:
+        raise UsageError("--resume is for runs as fast as possible; leave out --rate")
+    names = ("workers", "start", "end", "every", "rate", "profile", "desk", "with_inputs", "resume")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
         with watched(options.view, options.serve, rrd) as pipe:
@@ -87,5 +95,7 @@ def run(options: argparse.Namespace) -> int:
     from stages.kernel_loading import compiled_now
 
     report(summary, compiled_now())
+    if checkpoint_of(out).exists():
+        say("the same command goes on from the last checkpoint")
     write_text(options.summary, json.dumps(summary, indent=2))
     return exit_code(summary)

@@ -1,0 +1,174 @@
+"""`roverflow run --resume` goes on where a run was stopped or killed, and its outputs are those of a whole run."""
+
+import os
+import shutil
+import signal
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+
+from flow.cli import checkpoint_file
+from flow.cli.replay import replay
+from flow.errors import SinkError
+from recordings.mcap.digests import digests_of
+from recordings.simulator import Simulation, write_log
+
+FRAMES, STOP_AFTER = 7, 2
+OVERRIDES = ["disparities=32"]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A short traverse."""
+    path = tmp_path_factory.mktemp("log") / "traverse.mcap"
+    write_log(Simulation(frames=FRAMES, width=160, height=120, relief_cells=256, seed=3), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def whole(log, tmp_path_factory):
+    """The result log of a run that was not stopped; its recording is beside it."""
+    return run(log, tmp_path_factory.mktemp("whole"), resume=False, draw=True)[0]
+
+
+@pytest.fixture(autouse=True)
+def _checkpoint_after_each_frame(monkeypatch):
+    monkeypatch.setattr(checkpoint_file, "INTERVAL", 0.0)
+
+
+def run(log, folder, resume=True, draw=False, **options):
+    """(the result log, the summary) of a run."""
+    out = folder / "nav.mcap"
+    options = {"overrides": OVERRIDES, "on_frame": lambda complete: None, **options}
+    return out, replay(log, "fast", out, out.with_suffix(".rrd") if draw else None, resume=resume, **options)
+
+
+def after(frames, act):
+    """What calls `act` after some frames."""
+    through = []
+
+    def advance(complete):
+        through.append(complete)
+        if len(through) == frames:
+            act()
+
+    return advance
+
+
+def interrupt():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def drawn(recording):
+    """Entity -> the frames that it was logged at, without what is logged once and the times of the work."""
+    frames = Counter()
+    for chunk in rr.chunk.RrdReader(str(recording)).stream():
+        path, columns = chunk.entity_path, chunk.to_record_batch().to_pydict()
+        if "frame" in columns and not path.startswith(("/seconds", "/queues")):
+            frames.update((path, number) for number in columns["frame"])
+    return Counter({key: count for key, count in frames.items() if not key[0].endswith(("scale", "legend", "text"))})
+
+
+def names(folder):
+    return sorted(path.name for path in Path(folder).iterdir())
+
+
+def test_an_interrupted_run_goes_on_to_the_outputs_of_a_whole_one(log, whole, tmp_path):
+    out, stopped = run(log, tmp_path, draw=True, on_frame=after(STOP_AFTER, interrupt))
+    assert stopped["interrupted"]
+    assert names(tmp_path) == ["nav.mcap", "nav.mcap.checkpoint", "nav.rrd"]
+    out, summary = run(log, tmp_path, draw=True)
+    assert (summary["verdict"], summary["frames_through"]) == ("COMPLETE", FRAMES)
+    assert STOP_AFTER - 1 <= summary["frames_resumed"] < FRAMES
+    assert names(tmp_path) == ["nav.mcap", "nav.rrd"]
+    assert digests_of(out, False) == digests_of(whole, False)
+    assert drawn(out.with_suffix(".rrd")).keys() >= drawn(whole.with_suffix(".rrd")).keys()
+
+
+@pytest.mark.parametrize("options", [{"with_inputs": True}, {"profile": "foxglove", "draw": True}])
+def test_a_killed_run_goes_on_to_the_outputs_of_a_whole_one(log, tmp_path, options):
+    def kill():
+        shutil.copytree(tmp_path / "run", tmp_path / "killed")  # what a kill would leave
+
+    for folder in ("whole", "run"):
+        (tmp_path / folder).mkdir()
+    wanted, _ = run(log, tmp_path / "whole", resume=False, **options)
+    run(log, tmp_path / "run", on_frame=after(STOP_AFTER, kill), **options)
+    left = names(tmp_path / "killed")
+    assert "nav.mcap.checkpoint" in left
+    assert [name for name in left if name.endswith(".partial")]
+    out, summary = run(log, tmp_path / "killed", **options)
+    assert 0 < summary["frames_resumed"] <= STOP_AFTER
+    assert digests_of(out, copies="with_inputs" in options) == digests_of(wanted, copies="with_inputs" in options)
+    assert names(tmp_path / "killed") == names(tmp_path / "whole")
+
+
+def test_a_run_without_a_checkpoint_begins_with_the_first_frame(log, whole, tmp_path):
+    out, summary = run(log, tmp_path)
+    assert (summary["frames_resumed"], names(tmp_path)) == (0, ["nav.mcap"])
+    assert digests_of(out, False) == digests_of(whole, False)
+
+
+@pytest.fixture
+def stopped(log, tmp_path):
+    """The folder of an interrupted run."""
+    run(log, tmp_path, draw=True, on_frame=after(STOP_AFTER, interrupt))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        (["--set", "disparities=64"], "--set changed since the run that {} continues"),
+        (["-p", "rover"], "the pipeline file changed since"),
+        (["--no-rrd", "--end", "2"], "--end and an output or its options changed since"),
+        (["--rate", "2"], "--resume is for runs as fast as possible; leave out --rate"),
+    ],
+)
+def test_another_run_is_not_continued(log, stopped, said, changed, sentence):
+    same = [part for override in OVERRIDES for part in ("--set", override)]
+    before = {path: path.read_bytes() for path in stopped.iterdir()}
+    error = said(2, "run", log, "-p", "fast", "-o", stopped / "nav.mcap", *same, "--resume", *changed).err
+    assert sentence.format(stopped / "nav.mcap.checkpoint") in error
+    assert {path: path.read_bytes() for path in stopped.iterdir()} == before
+
+
+def test_a_run_without_resume_begins_anew_and_removes_the_checkpoint(log, stopped):
+    _, summary = run(log, stopped, resume=False, draw=True)
+    assert (summary["frames_resumed"], names(stopped)) == (0, ["nav.mcap", "nav.rrd"])
+
+
+def test_an_output_that_lacks_a_part_is_refused_and_stays(log, stopped):
+    for name in ("nav.mcap", "nav.rrd"):
+        content = (stopped / name).read_bytes()
+        (stopped / name).unlink()
+        with pytest.raises(SinkError, match=f"{name} lacks .* of the run that is to be resumed; run without --resume"):
+            run(log, stopped, draw=True)
+        (stopped / name).write_bytes(content[: len(content) // 3])
+        with pytest.raises(SinkError, match=f"{name} lacks .* of the run that is to be resumed; run without --resume"):
+            run(log, stopped, draw=True)
+        assert (stopped / name).read_bytes() == content[: len(content) // 3]
+        (stopped / name).write_bytes(content)
+    assert run(log, stopped, draw=True)[1]["verdict"] == "COMPLETE"
+
+
+def test_a_foreign_file_is_no_checkpoint(log, tmp_path, said):
+    foreign = tmp_path / "nav.mcap.checkpoint"
+    foreign.write_bytes(np.arange(9).tobytes())
+    error = said(2, "run", log, "-o", tmp_path / "nav.mcap", "--resume").err
+    assert error == (
+        f"roverflow: {foreign} is not a checkpoint; remove it, or choose another name for the result log\n"
+    )
+    checkpoint_file.remove_checkpoint(tmp_path / "nav.mcap")
+    assert foreign.exists()
+
+
+def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_run(log, tmp_path, monkeypatch, capsys):
+    (tmp_path / "nav.mcap.checkpoint").mkdir()
+    monkeypatch.setattr(checkpoint_file.CheckpointFile, "_read", lambda file: None)
+    _, summary = run(log, tmp_path)
+    assert summary["verdict"] == "COMPLETE"
+    assert capsys.readouterr().err.count("no further checkpoints: cannot write ") == 1
