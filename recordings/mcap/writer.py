@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
@@ -114,27 +116,37 @@ class Ros2Writer:
             if large:
                 self._writer.flush()
 
-    def written(self) -> Written:
-        """What the log contains. All of it is in the file by now."""
+    def flush(self) -> None:
+        """Write what has come so far into the file; the next message begins a chunk."""
         with self._reporting():
             self._writer.flush()
+
+    def written(self) -> Written:
+        """What the log contains up to the last `flush`, which the file has by now."""
         own = {topic: number for (topic, copy_of), (number, _) in self._channels.items() if copy_of is None}
         counts = {topic: self._counts[number] for topic, number in own.items()}
         return Written((self._partial.name, *self._continued), counts)
 
     def continue_from(self, before: Written) -> None:
-        """Copy what a log contained that is unfinished, or has got its name. Raises LogError if it is not all there."""
+        """Copy what a log contained that is unfinished, or has got its name, and that was flushed after each stamp.
+
+        Raises LogError if it is not all there.
+        """
         self._continued, left = before.partials, Counter(before.counts)
         partial = self.path.with_name(before.partials[0])
         path = partial if partial.exists() else self.path
         with suppress(LogError), McapFile(path) as log:
             own = {min(log.channels_of([topic]), default=-1) for topic in before.counts}
-            for item in log.messages(own):
-                if isinstance(item, RawMessage) and left[(channel := log.channels[item.channel]).topic]:
-                    left[channel.topic] -= 1
-                    self.add(channel.topic, kind_of(channel), item.log_time, item.data)
+            whole = (item for item in log.messages(own) if isinstance(item, RawMessage))
+            for _, items in groupby(whole, attrgetter("log_time")):
+                for item in items:
+                    channel = log.channels[item.channel]
+                    if left[channel.topic]:
+                        left[channel.topic] -= 1
+                        self.add(channel.topic, kind_of(channel), item.log_time, item.data)
+                self.flush()
                 if not left.total():
-                    return
+                    break
         if left.total():
             missing = counted(left.total(), "message")
             raise LogError(f"{path} lacks {missing} of the run that is to be resumed; run without --resume")

@@ -176,6 +176,7 @@ class McapSink:
         ]
         statuses = [*_statuses(record.entries), *health, *epochs]
         writer.write("/nav/diagnostics", diagnostics(stamp, statuses), stamp)
+        writer.flush()  # so that a resumed log has the same bytes
         self._last_stamp = stamp
 
     def checkpoint(self) -> tuple[Written, dict[str, Any]]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from distributed import Client
 
+from flow.cli import checkpoint_file
 from flow.cli.fleet.catalogue import Catalogue
 from flow.cli.fleet.engine import Fleet, cluster
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
@@ -87,6 +88,49 @@ def test_a_task_writes_what_run_writes_and_is_not_repeated(logs, tmp_path):
     assert (broken["state"], "is not an MCAP log" in broken["why"]) == ("unusable", True)
     absent = run_task(replace(task, job=replace(job, name="nix", log=logs / "nix.mcap")))
     assert (absent["state"], "paths must mean the same on all machines" in absent["why"]) == ("failed", True)
+
+
+STATES = """
+from dataclasses import dataclass
+from stages import StereoFrame
+
+@dataclass(frozen=True)
+class Locked:
+    def start(self):
+        return [lambda: None] if {locked} else []
+
+    def __call__(self, frame: StereoFrame, *, state) -> StereoFrame:
+        return frame
+"""
+
+
+@pytest.mark.parametrize("locked", [False, True])
+def test_a_task_goes_on_where_a_worker_died_if_the_pipeline_can(tmp_path, monkeypatch, locked):
+    monkeypatch.setattr(checkpoint_file, "INTERVAL", 0.0)
+    write_log(Simulation(frames=6, width=120, height=96, relief_cells=256), tmp_path / "log.mcap")
+    module = f"locked_{locked}"  # a module is imported once
+    (tmp_path / f"{module}.py").write_text(STATES.format(locked=locked))
+    (tmp_path / "own.yaml").write_text(TRAPPED.replace("trap.Trap", f"{module}.Locked"))
+    (job,) = jobs_of([str(tmp_path / "log.mcap")], tmp_path / "out")
+    task = Task(job, tmp_path / "out", Pipeline.of(str(tmp_path / "own.yaml"), ()), recording=False, workers=1)
+    died, write_text = tmp_path / "died", Path.write_text
+
+    def die(file, text):
+        if file == task.progress and text == "6" and not died.exists():  # five frames are through
+            shutil.copytree(tmp_path / "out", died)
+        return write_text(file, text)
+
+    monkeypatch.setattr(Path, "write_text", die)
+    wanted = run_task(task)
+    assert (died / "log-nav.mcap.checkpoint").exists() != locked
+    (died / "log-nav.mcap.1-0.partial").touch()
+    row = run_task(replace(task, folder=died))
+    same = ("state", "verdict", "frames", "complete", "losses", "result")
+    assert [row[name] for name in same] == [wanted[name] for name in same]
+    assert (died / "log-nav.mcap").read_bytes() == task.result.read_bytes()
+    assert {path.name for path in died.iterdir()} == {"log-nav.mcap", "log-nav.json"}
+    resumed = json.loads((died / "log-nav.json").read_text())["summary"]["frames_resumed"]
+    assert resumed == 0 if locked else resumed > 0
 
 
 @pytest.mark.slow

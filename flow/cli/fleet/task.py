@@ -15,13 +15,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from flow.cli.checkpoint_file import checkpoint_of
 from flow.cli.fleet.jobs import Job
 from flow.cli.replay import LIBRARIES, product_version, replay
 from flow.cli.report import by_cause
 from flow.config.loader import load, shipped
 from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
-from flow.errors import RoverflowError, UsageError
+from flow.errors import RoverflowError, SinkError, UsageError
 from flow.runtime.findings import lines
 from recordings.containers.digest import digest_lines
 from recordings.containers.finding import RESULT_ENDING
@@ -131,9 +132,8 @@ def run_task(task: Task) -> dict[str, Any]:
     if why := _absent(task):  # no fault of the log
         return task.identity() | node | {"state": "failed", "why": f"{platform.node()} {why}"}
     task.result.parent.mkdir(parents=True, exist_ok=True)
-    for stale in task.result.parent.glob(f"{task.result.name}.*.partial"):  # of a worker that died
-        with suppress(OSError):
-            stale.unlink()
+    if not checkpoint_of(task.result).exists():
+        _remove_unfinished(task)
     try:
         summary = _run(task)
     except Exception as error:  # the log, a stage of the user's own, or the disk
@@ -144,6 +144,8 @@ def run_task(task: Task) -> dict[str, Any]:
     finally:
         with suppress(OSError):
             task.progress.unlink()
+    if not checkpoint_of(task.result).exists():
+        _remove_unfinished(task)
     row = task.identity() | node | _columns(summary)
     partial = task.result.with_name(f"{task.result.name}.{os.getpid()}-note.partial")
     partial.write_text(json.dumps({"row": row, "summary": summary}, indent=2))
@@ -164,7 +166,23 @@ def _run(task: Task) -> dict[str, Any]:
     count(True)
     recording = task.result.with_suffix(".rrd") if task.recording else None
     log, pipeline, changes = task.job.log, task.pipeline.local(), task.pipeline.changes
-    return replay(log, pipeline, task.result, recording, overrides=changes, workers=task.workers, on_frame=count)
+    options: dict[str, Any] = {"overrides": changes, "workers": task.workers, "on_frame": count}
+    try:
+        return replay(log, pipeline, task.result, recording, **options, resume=True)
+    except (UsageError, SinkError) as error:
+        summary = getattr(error, "summary", {})
+        if summary.get("frames_through") != summary.get("frames_resumed"):  # it went on, and failed later
+            raise
+    # The pipeline cannot be resumed, or has changed, or what a worker has written that died is gone.
+    return replay(log, pipeline, task.result, recording, **options)
+
+
+def _remove_unfinished(task: Task) -> None:
+    """Remove what workers that died have left of the task's outputs."""
+    for suffix in (".mcap", ".rrd"):
+        for unfinished in task.result.parent.glob(f"{task.result.stem}{suffix}.*.partial"):
+            with suppress(OSError):
+                unfinished.unlink()
 
 
 def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
