@@ -10,20 +10,20 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from mcap.records import Schema
+
 from recordings.containers.container import Channel, MessageSchema
+from recordings.discovery.roles import IMAGES
 from recordings.encodings.foxglove import adapter_of, with_header
 from recordings.encodings.json_text import json_decoder
-from recordings.encodings.protobuf import protobuf_decoder
-from recordings.errors import LogError
+from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, Unpacking
 from recordings.ros1.codec import decoder_for as ros1_decoder
 from recordings.ros2.cdr import decoder_for as cdr_decoder
 from recordings.ros2.cdr import full_name, is_packed, plain
-from recordings.video.formats import VIDEO
 
 MAX_SCHEMA_BYTES = 1_000_000  # of all schemas of a log without comments; those in use have a fifth of it
 MAX_MESSAGE_BYTES = 4_000_000  # of a message that is no image; none in use has a tenth of it
-_IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", VIDEO)
 ENCODINGS = ("cdr", "ros1", "protobuf", "json")
 
 Decoder = Callable[[bytes | memoryview], Any]
@@ -43,7 +43,7 @@ def decoder_of(channel: Channel, unpacking: Unpacking | None = None) -> tuple[st
     adapted = adapter_of(name)
     ros_name, adapt = adapted or (full_name(name), with_header if encoding in ("protobuf", "json") else None)
 
-    limit, unpacking = MAX_CHUNK_BYTES if ros_name in _IMAGES else MAX_MESSAGE_BYTES, unpacking or Unpacking()
+    limit, unpacking = MAX_CHUNK_BYTES if ros_name in IMAGES else MAX_MESSAGE_BYTES, unpacking or Unpacking()
 
     def decoded(data: bytes | memoryview) -> Any:
         if encoding == "cdr" and is_packed(data):
@@ -66,6 +66,20 @@ def _plain_decoder(encoding: str, schema: MessageSchema | None) -> Decoder:
     if schema is None or encoding == "json":
         return json_decoder
     if encoding == "protobuf":
-        return protobuf_decoder(schema)
+        return _protobuf_decoder(schema)
     codec = ros1_decoder if encoding == "ros1" else cdr_decoder
     return codec(schema.name, schema.encoding, schema.text)
+
+
+def _protobuf_decoder(schema: MessageSchema) -> Decoder:
+    """A function from bytes to a protobuf message. Raises LogError for descriptors that cannot be used."""
+    from mcap_protobuf.decoder import DecoderFactory  # takes long to import
+
+    record = Schema(id=1, name=schema.name, encoding=schema.encoding, data=schema.text)
+    try:
+        decode = DecoderFactory().decoder_for("protobuf", record)
+    except Exception as error:  # foreign descriptors may fail the library in any way
+        raise LogError(f"schema '{schema.name}' cannot be used ({sentence_of(error)})") from error
+    if decode is None:
+        raise LogError(f"schema '{schema.name}' is in '{schema.encoding}', not in 'protobuf'")
+    return lambda data: decode(bytes(data))

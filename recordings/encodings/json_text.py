@@ -21,7 +21,7 @@ def json_decoder(data: bytes | memoryview) -> Any:
         if sum(text.count(mark.encode()) for mark in marks) > limit:
             raise LogError(f"it has more than {limit} {name}")
     try:
-        message = json.loads(text, object_hook=_object)
+        message = json.loads(text, object_hook=lambda fields: SimpleNamespace(**fields))
         if _SURROGATE.search(text):  # a half of one is no character, and no output could contain it
             json.dumps(json.loads(text), ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
@@ -29,7 +29,3 @@ def json_decoder(data: bytes | memoryview) -> Any:
     if not isinstance(message, SimpleNamespace):
         raise LogError(f"it is a JSON {type(message).__name__}, not an object")
     return message
-
-
-def _object(fields: dict[str, Any]) -> SimpleNamespace:
-    return SimpleNamespace(**{str(name): value for name, value in fields.items()})
