@@ -115,6 +115,19 @@ class Container(ABC):
     def read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
         """The messages at some places of the timeline, in that order."""
 
+    def _read_each(
+        self, places: Places, content: Callable[[int], memoryview | str]
+    ) -> Iterator[RawMessage | LostMessage]:
+        """The messages at some places. content: place -> the bytes of its message, or why it is lost."""
+        for block in blocks(places):
+            columns = block, self.timeline.channels[block], self.timeline.log_times[block]
+            for place, channel, log_time in zip(*(column.tolist() for column in columns), strict=True):
+                found = content(place)
+                if isinstance(found, str):
+                    yield LostMessage(channel, log_time, found)
+                else:
+                    yield RawMessage(channel, log_time, found)
+
     def _ends(self, why: str = "") -> tuple[int, int]:
         """The log time of the first and the last message. Raises LogError if there is none; `why` may be known."""
         times = self.timeline.log_times[self.timeline.log_times >= 0]

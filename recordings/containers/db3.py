@@ -26,7 +26,6 @@ from recordings.containers.container import (
     LostMessage,
     MessageSchema,
     RawMessage,
-    blocks,
 )
 from recordings.containers.timeline import Places, Timeline
 from recordings.errors import LogError, sentence_of
@@ -71,15 +70,7 @@ class Db3File(Container):
 
     def read(self, places: Places, size: int = MAX_STORED_BYTES) -> Iterator[RawMessage | LostMessage]:
         """The first `size` bytes of the messages at some places of the timeline."""
-        for block in blocks(places):
-            wanted = self.timeline.channels, self.timeline.log_times, self._rows[0]
-            columns = (column[block].tolist() for column in wanted)
-            for channel, log_time, row in zip(*columns, strict=True):
-                data = self._data_or_reason(row, size)
-                if isinstance(data, str):
-                    yield LostMessage(channel, log_time, data)
-                else:
-                    yield RawMessage(channel, log_time, data)
+        return self._read_each(places, lambda place: self._data_or_reason(int(self._rows[0][place]), size))
 
     def close(self) -> None:
         """Close the file."""

@@ -24,7 +24,6 @@ from recordings.containers.container import (
     MessageSchema,
     OpenChunks,
     RawMessage,
-    blocks,
 )
 from recordings.containers.timeline import Places, Timeline
 from recordings.errors import LogError, sentence_of
@@ -68,16 +67,14 @@ class Ros1Bag(Container):
 
     def read(self, places: Places) -> Iterator[RawMessage | LostMessage]:
         """The messages at some places of the timeline."""
-        timeline, (of_chunk, _, entries) = self.timeline, self._bag.entries
+        of_chunk, _, entries = self._bag.entries
         opened = OpenChunks(of_chunk[places], lambda number: self._unpacked(self._bag.places[number]))
-        for block in blocks(places):
-            columns = of_chunk[block], entries["offset"][block], timeline.channels[block], timeline.log_times[block]
-            for number, offset, channel, log_time in zip(*(column.tolist() for column in columns), strict=True):
-                found = _message_at(opened.of_next(number), self._bag.places[number], offset)
-                if isinstance(found, str):
-                    yield LostMessage(channel, log_time, found)
-                else:
-                    yield RawMessage(channel, log_time, found)
+
+        def content(place: int) -> memoryview | str:
+            number = int(of_chunk[place])
+            return _message_at(opened.of_next(number), self._bag.places[number], int(entries["offset"][place]))
+
+        return self._read_each(places, content)
 
     def close(self) -> None:
         """Close the file."""
