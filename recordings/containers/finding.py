@@ -72,7 +72,7 @@ def first_bytes(path: Path, kind: str = "a log") -> bytes:
 def _files_of(folder: Path) -> FoundFiles:
     """The files of the recording in a folder."""
     try:
-        present = sorted((path for path in folder.iterdir() if _is_recording(path)), key=_natural)
+        present = sorted(filter(_is_recording, folder.iterdir()), key=lambda path: natural(path.name))
     except OSError as error:
         raise LogError(f"cannot read {folder}: {error.strerror or error}") from error
     listed = _listed(folder / METADATA)
@@ -115,9 +115,9 @@ def _is_recording(path: Path) -> bool:
     return name.endswith(SUFFIXES) and not Path(name).stem.endswith(RESULT_ENDING) and path.is_file()
 
 
-def _natural(path: Path) -> tuple[Any, ...]:
-    """A key that sorts _2 before _10."""
-    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name))
+def natural(name: str) -> list[Any]:
+    """A key that sorts _2 before _10: texts and numbers by turns."""
+    return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", name))]
 
 
 def _group(path: Path) -> str:
@@ -129,7 +129,11 @@ def _split_of(path: Path) -> str:
     """A sentence, if a file is one of several of a recording; else an empty string."""
     siblings = [other for other in _neighbours(path) if _group(other) == _group(path) and _is_recording(other)]
     listed = _listed(path.with_name(METADATA))
-    names = listed if path.name in listed else [other.name for other in sorted(siblings, key=_natural)]
+    names = (
+        listed
+        if path.name in listed
+        else [other.name for other in sorted(siblings, key=lambda path: natural(path.name))]
+    )
     starts_at_zero = re.search(r"_0\.", names[0]) if names else None
     if len(names) < 2 or path.name not in names or not (path.name in listed or starts_at_zero):
         return ""

@@ -119,12 +119,10 @@ def encoding_of(content: bytes) -> str:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, px. Raises LogError."""
-    content = read_bytes(path)
-    size = stated_size(content)
-    if size is None:
-        height, width = read_pixels(path).shape[:2]
-        return width, height
-    return size
+    if size := stated_size(read_bytes(path)):
+        return size
+    height, width = read_pixels(path).shape[:2]
+    return width, height
 
 
 def read_pixels(path: Path) -> Array:

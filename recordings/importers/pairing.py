@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from flow.contracts import counted
+from recordings.containers.finding import natural
 from recordings.discovery import images
 from recordings.errors import LogError
 
@@ -36,7 +37,9 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
     if not folder.is_dir():
         raise LogError(f"{folder} is not a folder; give the folder with the left and right images")
     candidates = (f for pattern in ("*", "[!.]*/*") for f in folder.glob(pattern))
-    files = sorted((f for f in candidates if f.suffix.lower() in SUFFIXES), key=lambda f: _natural(f, folder))
+    files = sorted(
+        (f for f in candidates if f.suffix.lower() in SUFFIXES), key=lambda f: natural(f.relative_to(folder).as_posix())
+    )
     named = {file.relative_to(folder).as_posix(): file for file in files}
     names = {name: file for name, file in named.items() if not _NOT_CAMERAS.search(name)}
     for word, other in SIDES:
@@ -62,9 +65,3 @@ def pair_images(folder: Path) -> tuple[list[Path], list[Path]]:
         f"{folder} contains no image pairs, only {found}; the two names of a pair must differ in left/right, l/r or "
         "cam0/cam1"
     )
-
-
-def _natural(file: Path, folder: Path) -> list[tuple[int, int, str]]:
-    """A sort key with the numbers in a name by value."""
-    parts = re.split(r"(\d+)", file.relative_to(folder).as_posix())
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
