@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
 from heapq import merge
@@ -68,7 +69,7 @@ def _repeated(step: ClockStep) -> str:
     )
 
 
-class Recording:
+class Recording(AbstractContextManager["Recording"]):
     """The messages of one or several files as one log; use it as a context manager.
 
     path: what the user gave, the file or the folder; files: in the order in which they were recorded; missing:
@@ -79,12 +80,7 @@ class Recording:
     """
 
     def __init__(
-        self,
-        path: Path,
-        files: Sequence[Container],
-        missing: Sequence[str],
-        part: str,
-        on_close: Callable[[], object],
+        self, path: Path, files: Sequence[Container], missing: Sequence[str], part: str, on_close: Callable[[], object]
     ) -> None:
         self.path, self.files, self.part, self._missing = path, files, part, missing
         self._on_close = on_close
@@ -213,9 +209,6 @@ class Recording:
     def close(self) -> None:
         """Close the files."""
         self._on_close()
-
-    def __enter__(self) -> Recording:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()

@@ -7,6 +7,7 @@ little ahead of the images, so that no image is delivered with a calibration tha
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from heapq import merge
 from itertools import chain
@@ -43,7 +44,7 @@ STREAMS = (*CAMERAS, "inclinometer", "mount", "odometry")
 
 
 @dataclass
-class McapLog:
+class McapLog(AbstractContextManager["McapLog"]):
     """An opened log.
 
     missing: stream -> why the log does not provide it, and the remedy; refused: setting of the source that contradicts
@@ -99,7 +100,7 @@ class McapLog:
     def events(self, streams: Collection[str] = STREAMS) -> Iterator[tuple[int, str, Any]]:
         """(Log time in ns, stream, item) for each message of some streams; a lost item is an exception."""
         part = self._range()
-        return self._between(part, FramesInRange(part, self._lefts_around(part)), streams)
+        return self._between(FramesInRange(part, self._lefts_around(part)), streams)
 
     def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
         """The events of a few frames at `count` places of the whole log, independent of the range that is read."""
@@ -110,7 +111,7 @@ class McapLog:
             # Stamps precede log times, so begin after the previous image.
             low = times[first - 1] + 1 if first else None
             part = TimeRange(low, times[last] + MAX_LATENESS_NS)
-            yield self._between(part, FramesInRange(part, ()), streams, ahead)
+            yield self._between(FramesInRange(part, ()), streams, ahead)
 
     def _lefts_around(self, part: TimeRange) -> Iterator[tuple[int, int]]:
         """Stamp and log time, ns, of the left images around the edges of a part."""
@@ -120,11 +121,11 @@ class McapLog:
                     yield self.stamp_of(raw, "left"), raw.log_time
 
     def _between(
-        self, part: TimeRange, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS
+        self, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS
     ) -> Iterator[tuple[int, str, Any]]:
-        events, tilt = self._read(part, frames, streams, ahead), self.resolution.tilt
+        events, tilt = self._read(frames, streams, ahead), self.resolution.tilt
         if "inclinometer" in streams and "inclinometer" in self.topics and tilt is not None and tilt.estimates:
-            events = merge(events, self._estimated(part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
+            events = merge(events, self._estimated(frames.part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
         for log_time, stream, item in events:
             offset = 0 if isinstance(item, Exception) else self.time_offset(stream)
             yield log_time, stream, replace(item, stamp=item.stamp + offset) if offset else item
@@ -145,11 +146,9 @@ class McapLog:
             if isinstance(raw, RawMessage):
                 yield from ((raw.log_time, reader(raw)) for reader in readers[raw.channel])
 
-    def _read(
-        self, part: TimeRange, frames: FramesInRange, streams: Collection[str], ahead: int
-    ) -> Iterator[tuple[int, str, Any]]:
+    def _read(self, frames: FramesInRange, streams: Collection[str], ahead: int) -> Iterator[tuple[int, str, Any]]:
         """The events without estimates. ahead: how much earlier, ns, than the part an image of it may be logged."""
-        wide, near = part.widened(MAX_LATENESS_NS, ahead), part.widened(INTERPOLATION_LEAD_NS)
+        wide, near = frames.part.widened(MAX_LATENESS_NS, ahead), frames.part.widened(INTERPOLATION_LEAD_NS)
         log_start = max(wide.low or 0, self.file.start)
         for stream, problem in self.resolution.problems:
             if stream in (*streams, "log"):
@@ -183,10 +182,10 @@ class McapLog:
                 continue
             for reader in readers_of.get(channel, []):
                 # Later images of a video need those before.
-                if reader.video is not None or self._is_inside(raw, reader.stream, part, near, frames):
+                if reader.video is not None or self._is_inside(raw, reader.stream, near, frames):
                     found.append((reader.stream, reader(raw)))
             for stream, item in found:
-                if item is None or not self._is_inside(raw, stream, part, near, frames):
+                if item is None or not self._is_inside(raw, stream, near, frames):
                     continue
                 if moving is not None and stream == "left" and isinstance(item, CameraImage):
                     mount = attempt(moving.at, item.stamp)
@@ -202,9 +201,9 @@ class McapLog:
             return lost.log_time, "log", LogError(f"{self.path.name}: {lost.reason}")
         return lost.log_time, readers[-1].stream, LogError(f"{readers[-1].topic}: {lost.reason}")
 
-    def _is_inside(self, raw: RawMessage, stream: str, part: TimeRange, near: TimeRange, frames: FramesInRange) -> bool:
+    def _is_inside(self, raw: RawMessage, stream: str, near: TimeRange, frames: FramesInRange) -> bool:
         """Whether a message belongs to a part, or, of other streams than the images, to its surroundings."""
-        if not part.edges:
+        if not frames.part.edges:
             return True
         stamp = self.stamp_of(raw, stream)
         return frames.has(stream, stamp, raw.log_time) if stream in CAMERAS else near.has(stamp, raw.log_time)
@@ -266,9 +265,6 @@ class McapLog:
     def close(self) -> None:
         """Close the file."""
         self.file.close()
-
-    def __enter__(self) -> McapLog:
-        return self
 
     def __exit__(self, *raised: object) -> None:
         self.close()
