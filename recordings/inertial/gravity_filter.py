@@ -60,9 +60,7 @@ def first_state(force: Array, bias: Array, accelerometer_bias: float, gravity: f
     """The state before the first block; force: (3,) m/s^2 of the first accelerations; bias: (3,) rad/s; gravity: its
     magnitude, if it is known."""
     up = force / np.linalg.norm(force)
-    covariance = np.diag(
-        [START_SIGMA**2] * 3 + [GYROSCOPE_BIAS_SIGMA**2] * 3 + [accelerometer_bias**2] * 3,
-    ).astype(np.float64)
+    covariance: Array = np.diag(np.repeat([START_SIGMA**2, GYROSCOPE_BIAS_SIGMA**2, accelerometer_bias**2], 3))
     if gravity is not None:
         covariance[S, S] -= (START_SIGMA**2 - GIVEN_GRAVITY_SIGMA**2) * np.outer(up, up)
     return GravityState(np.concatenate([force if gravity is None else gravity * up, bias, np.zeros(3)]), covariance)

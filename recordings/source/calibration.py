@@ -107,10 +107,7 @@ def calibrated_pair(
 
 
 def baseline_note(
-    cameras: tuple[Camera, Camera],
-    models: tuple[CameraModel, CameraModel],
-    names: tuple[str, str],
-    tree: TransformTree,
+    cameras: tuple[Camera, Camera], models: tuple[CameraModel, CameraModel], names: tuple[str, str], tree: TransformTree
 ) -> Finding | None:
     """A note if the baseline of a calibrated pair comes from a static transform, a warning if it contradicts it."""
     right_in_left = tree.between(*names)

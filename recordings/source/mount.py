@@ -41,11 +41,9 @@ def pose_of_base(pose: Pose, camera: Camera, base: str, tree: TransformTree) -> 
     of = pose.child_frame_id
     if of in (base, camera.image_frame):
         return pose
-    if of != camera.frame_id and tree.between(of, base) is not None:
-        part = tree.between(of, base)
-    else:
-        to_camera = tree.between(of, camera.frame_id)
-        part = None if to_camera is None else to_camera.after(camera.image)
+    part = None if of == camera.frame_id else tree.between(of, base)
+    if part is None and (to_camera := tree.between(of, camera.frame_id)) is not None:
+        part = to_camera.after(camera.image)
     return pose if part is None else pose.of(part)
 
 

@@ -59,7 +59,8 @@ class StreamReaders:
             return []
         if reading.estimates:
             return [
-                replace(each, decoders=dict.fromkeys(each.decoders, bytes), item=_nothing) for each in self.of_samples()
+                replace(each, decoders=dict.fromkeys(each.decoders, bytes), item=lambda message, time: None)
+                for each in self.of_samples()
             ]
         noise = TiltNoise()
 
@@ -102,10 +103,6 @@ def by_channel(readers: Iterable[TopicReader]) -> dict[int, list[TopicReader]]:
         for channel in reader.decoders:
             found[channel].append(reader)
     return dict(found)
-
-
-def _nothing(message: Any, log_time: int) -> None:
-    """No item."""
 
 
 def _by_stamp_alone(item: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:
