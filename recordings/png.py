@@ -32,9 +32,10 @@ def png(pixels: Array) -> bytes:
     bits = 1 if pixels.dtype == bool else 8 * size
     header = struct.pack(">IIBBBBB", width, height, bits, 2 if rgb else 0, 0, 0, 0)
     parts = (b"IHDR", header), (b"IDAT", compress(rows, _LEVEL)), (b"IEND", b"")
-    return _SIGNATURE + b"".join(_chunk(kind, content) for kind, content in parts)
+    return _SIGNATURE + b"".join(chunk(kind, content) for kind, content in parts)
 
 
-def _chunk(kind: bytes, content: bytes) -> bytes:
+def chunk(kind: bytes, content: bytes) -> bytes:
+    """A chunk of a PNG file, with its length and its checksum."""
     checksum = crc32(content, crc32(kind))
     return b"".join((struct.pack(">I", len(content)), kind, content, struct.pack(">I", checksum)))

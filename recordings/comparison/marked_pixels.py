@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 
 import cv2
@@ -11,7 +9,7 @@ import numpy as np
 
 from recordings.atomic_write import written
 from recordings.export.page_layout import page_of
-from recordings.png import png
+from recordings.png import chunk, png
 from recordings.sinks.colormaps import top_eight_bits
 from recordings.sinks.overwrite import PICTURE
 from stages.data import Array
@@ -51,7 +49,5 @@ def _around(rgb: Array, rows: Array, cols: Array) -> Array:
 
 def _named(picture: bytes) -> bytes:
     """A PNG file with the name of the program, by which a later picture may replace it."""
-    chunk = b"tEXt" + PICTURE
-    named = struct.pack(">I", len(PICTURE)) + chunk + struct.pack(">I", zlib.crc32(chunk))
     header = 33  # bytes of the signature and the first chunk
-    return picture[:header] + named + picture[header:]
+    return picture[:header] + chunk(b"tEXt", PICTURE) + picture[header:]
