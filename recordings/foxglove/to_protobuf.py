@@ -48,10 +48,6 @@ def _time(stamp: Any) -> Timestamp:
     return Timestamp(seconds=stamp.sec, nanos=stamp.nanosec)
 
 
-def _disparity(message: Any) -> Iterator[Any]:
-    return _image(message.image)
-
-
 def _image(message: Any) -> Iterator[Any]:
     yield RawImage(
         **_stamped(message.header), width=message.width, height=message.height, encoding=message.encoding,
@@ -136,11 +132,8 @@ def _grid(
 
 
 def _odometry(message: Any) -> Iterator[Any]:
-    yield PoseInFrame(**_stamped(message.header), pose=_pose(message.pose.pose))
-
-
-def _pose(pose: Any) -> Pose:
-    return Pose(position=_vector(pose.position), orientation=_quaternion(pose.orientation))
+    place, turn = message.pose.pose.position, message.pose.pose.orientation
+    yield PoseInFrame(**_stamped(message.header), pose=Pose(position=_vector(place), orientation=_quaternion(turn)))
 
 
 def _vector(vector: Any) -> Vector3:
@@ -173,7 +166,7 @@ def _logs(message: Any) -> Iterator[Any]:
 
 
 _CONVERSIONS: dict[str, Callable[[Any], Iterator[Any]]] = {
-    "stereo_msgs/msg/DisparityImage": _disparity,
+    "stereo_msgs/msg/DisparityImage": lambda message: _image(message.image),
     "sensor_msgs/msg/Image": _image,
     "sensor_msgs/msg/CompressedImage": _compressed,
     "sensor_msgs/msg/CameraInfo": _calibration,

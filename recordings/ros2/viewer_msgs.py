@@ -60,10 +60,10 @@ def left_messages(frame: StereoFrame, eight_bits: Array, with_calibration: bool)
     return messages
 
 
-def code_image(stamp: int, frame_id: str, codes: Array, colors: Mapping[int, tuple[int, int, int]]) -> Any:
-    """Codes (H, W) as a coloured PNG image. colors: code -> RGB."""
+def code_image(stamp: int, frame_id: str, codes: Array, legend: Mapping[int, tuple[str, tuple[int, int, int]]]) -> Any:
+    """Codes (H, W) as a coloured PNG image. legend: code -> name and RGB."""
     table = np.full((256, 3), 255, np.uint8)
-    for code, rgb in colors.items():
+    for code, (_, rgb) in legend.items():
         table[code & 0xFF] = rgb[::-1]
     _, blob = cv2.imencode(".png", table[codes.astype(np.uint8)], [cv2.IMWRITE_PNG_COMPRESSION, 1])
     return compressed_image(stamp, frame_id, blob.reshape(-1), "png")

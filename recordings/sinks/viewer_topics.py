@@ -38,15 +38,14 @@ def viewer_messages(
             case Disparity():
                 for below, message in depth_messages(_seen(item, taken)).items():
                     yield topic + below, message
-                colors = {code: rgb for code, (_, rgb) in SOURCE_LEGEND.items()}
                 frame_id = item.camera.frame_id if item.camera is not None else "camera"
-                yield f"{topic}/source/color/compressed", code_image(item.stamp, frame_id, item.source, colors)
+                yield f"{topic}/source/color/compressed", code_image(item.stamp, frame_id, item.source, SOURCE_LEGEND)
             case ElevationMap():
                 yield f"{topic}/points", terrain_points(item, elevation_colors(item))
             case NavigationMap():
-                colors = {code: rgb for code, (_, rgb) in REASON_LEGEND.items()}
                 above = f"{stream}/above"  # rerun draws a picture in 3D only in the frame of a camera
-                yield f"{topic}/reason/color/compressed", code_image(item.stamp, above, birds_eye(item.reason), colors)
+                seen_from_above = birds_eye(item.reason)
+                yield f"{topic}/reason/color/compressed", code_image(item.stamp, above, seen_from_above, REASON_LEGEND)
                 info, placed = camera_above(item, above)
                 yield f"{topic}/reason/camera_info", info
                 yield "/tf", placed
