@@ -71,10 +71,7 @@ def remedies(description: Mapping[str, Any]) -> list[str]:
 def pipeline_for(pipeline: str, source: LogSettings, log: McapLog) -> str:
     """The text of a pipeline file whose source names the topics of a log; what is missing is in its comments.
 
-    Raises
-    ------
-    UsageError
-        If the pipeline has no `source` at the beginning of a line.
+    Raises UsageError if the pipeline has no `source` at the beginning of a line.
     """
     resolution = log.resolution
     own = {

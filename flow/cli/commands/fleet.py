@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -81,7 +82,7 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
     same = (pipeline.digest, product_version(), folder, options.rrd)
     why = {job: reason_to_run(job, rows.get(job.name), *same) for job in jobs}
     due = [job for job, reason in why.items() if reason]
-    reasons = {reason: sum(other == reason for other in why.values()) for reason in why.values() if reason}
+    reasons = Counter(filter(None, why.values()))
     size, listed = sum(job.size for job in due) / 1e9, ", ".join(f"{n} {reason}" for reason, n in reasons.items())
     more = f" ({listed}), {size:.2f} GB" if due else ""
     say(f"{counted(len(jobs), 'log')}: {len(jobs) - len(due)} done before, {len(due)} to run{more}")
@@ -102,9 +103,7 @@ def _verdict(rows: list[dict[str, object]], folder: Path) -> int:
     """Print how many logs ended how."""
     from flow.cli.fleet.catalogue import outcome
 
-    ended = [outcome(row) for row in rows]
-    say(
-        ", ".join(f"{ended.count(name)} {name}" for name in dict.fromkeys(sorted(ended)))
-        + f"; roverflow list {folder} lists them"
-    )
+    ended = Counter(map(outcome, rows))
+    counts = ", ".join(f"{number} {name}" for name, number in sorted(ended.items()))
+    say(f"{counts}; roverflow list {folder} lists them")
     return COMPLETE if set(ended) <= {"COMPLETE"} else INCOMPLETE

@@ -20,10 +20,7 @@ OPEN = "open the recording with rerun, or give --at a time"
 def without_cursor(at: At, port: int = PORT) -> float | np.datetime64 | np.timedelta64:
     """An instant of the command line, that of the viewer in place of CURSOR.
 
-    Raises
-    ------
-    UsageError
-        If no viewer answers, or its cursor is on a timeline without stamps.
+    Raises UsageError if no viewer answers, or its cursor is on a timeline without stamps.
     """
     import numpy as np
 

@@ -63,12 +63,8 @@ def run_variants(
     these logs cover, and notes for a terminal.
 
     pipeline: its name; or a result log of it, which then has the state before the instant; at, frames, before: as for
-    `part_of`. The result logs have only the frames from the instant on.
-
-    Raises
-    ------
-    UsageError
-        If a run would refuse the log, or the variants cannot be joined.
+    `part_of`. The result logs have only the frames from the instant on. Raises UsageError if a run would refuse the
+    log, or the variants cannot be joined.
     """
     from stages.kernel_loading import loading_kernels
 

@@ -30,21 +30,10 @@ HOLD_SECONDS = 2.0  # for which a client waits for --watch, which holds the lock
 
 
 class Catalogue:
-    """The rows of a folder's catalogue.
+    """The rows of a fleet's folder. create: whether to make a catalogue that is not there.
 
-    Parameters
-    ----------
-    folder : Path
-        The folder of a fleet.
-    create : bool
-        Whether to make a catalogue that is not there.
-
-    Raises
-    ------
-    UsageError
-        If there is no catalogue, or the file is not one.
-    UnwritableError
-        If it cannot be written, as on a full disk.
+    Raises UsageError if there is no catalogue, or the file is not one, and UnwritableError if it cannot be written, as
+    on a full disk.
     """
 
     def __init__(self, folder: Path, create: bool = False) -> None:
@@ -139,7 +128,7 @@ def outcome(row: Mapping[str, Any]) -> str:
 def as_table(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
     """Rows as an aligned text table."""
     names = list(columns)
-    cells = [names, *([_shown(row[name]) for name in names] for row in rows)]
+    cells = [names, *([shown(row[name]) for name in names] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return "\n".join(
         "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells
@@ -157,7 +146,8 @@ def _locked(file: int, kind: int) -> bool | None:
     return True
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
+    """A value of a row as text."""
     if value is None:
         return ""
     return f"{value:.1f}" if isinstance(value, float) else str(value)

@@ -91,9 +91,8 @@ class Fleet:
         for worker, about in found.items():
             for name, here in expected.items():
                 if about[name] != here:
-                    raise UsageError(
-                        f"the worker {worker} has another {name} ({about[name]}) than this machine ({here})"
-                    )
+                    differ = f"another {name} ({about[name]}) than this machine ({here})"
+                    raise UsageError(f"the worker {worker} has {differ}")
         for worker, why in client.run(unfit, task).items():
             if why:
                 raise UsageError(f"the worker {worker} {why}")
@@ -173,12 +172,8 @@ def _ended(task: Task, row: Mapping[str, Any]) -> dict[str, Any]:
 def cluster(address: str | None, processes: int, cores: int, memory: str, dashboard: bool) -> Iterator[Any]:
     """A client of the Dask cluster at `address`, or of worker processes of this machine that end with it.
 
-    cores: of each process, to which it is bound.
-
-    Raises
-    ------
-    UsageError
-        If the extra `fleet` is missing, or nothing answers at the address.
+    cores: of each process, to which it is bound. Raises UsageError if the extra `fleet` is missing, or nothing answers
+    at the address.
     """
     try:
         import dask

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from flow.cli.fleet.catalogue import NAME, Catalogue, outcome
+from flow.cli.fleet.catalogue import NAME, Catalogue, outcome, shown
 from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.reporting.page import html_table, write_page
@@ -65,7 +65,7 @@ def _cell(row: Mapping[str, Any], column: str) -> str:
     value = row[column]
     if column == "findings":
         return " ".join(f"{stream}: {sentence}" for stream, sentence in json.loads(value or "{}").items())
-    return "" if value is None else f"{value:.1f}" if isinstance(value, float) else str(value)
+    return shown(value)
 
 
 def _mean(values: Sequence[float]) -> float:

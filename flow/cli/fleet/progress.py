@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import Counter
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -21,12 +22,7 @@ WATCH_SECONDS = 2.0
 class Progress(AbstractContextManager["Progress"]):
     """Logs, frames and bytes of a fleet.
 
-    Parameters
-    ----------
-    left : mapping
-        Name -> bytes of each log that has not ended.
-    logs, frames : int
-        The logs that have ended before, and their frames.
+    left: name -> bytes of each log that has not ended; logs, frames: those that have ended before, and their frames.
     """
 
     def __init__(self, left: Mapping[str, int], logs: int = 0, frames: int = 0) -> None:
@@ -129,8 +125,8 @@ def _active(rows: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 def _states(rows: Mapping[str, dict[str, Any]]) -> str:
     """How many logs have which state, with the frames of those that have ended and the bytes of the others."""
-    states = [str(row["state"]) for row in rows.values()]
-    line = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(sorted(states)))
+    states = Counter(str(row["state"]) for row in rows.values())
+    line = ", ".join(f"{number} {state}" for state, number in sorted(states.items()))
     frames = sum(row["frames"] or 0 for row in rows.values())
     left = sum(row["bytes"] for row in _active(rows).values())
     return f"{line}; {counted(frames, 'frame')} so far, {left / 1e9:.2f} GB left"
