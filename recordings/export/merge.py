@@ -81,13 +81,11 @@ class Merged:
             if found.conflicts:
                 names = f"{self._name_of(first)} and {self._name_of(second)}"
                 x, y = found.place
-                yield (
-                    found.conflicts > MAX_CONFLICT_SHARE * found.cells,
-                    (
-                        f"{names} conflict in {found.conflicts} of {found.cells} common cells: second minus first is "
-                        f"{found.mean:+.3f} m on average, {found.largest:+.3f} m at ({x:.2f}, {y:.2f}) m"
-                    ),
+                sentence = (
+                    f"{names} conflict in {found.conflicts} of {found.cells} common cells: second minus first is "
+                    f"{found.mean:+.3f} m on average, {found.largest:+.3f} m at ({x:.2f}, {y:.2f}) m"
                 )
+                yield found.conflicts > MAX_CONFLICT_SHARE * found.cells, sentence
         paired = {number for pair in self.overlaps for number in pair}
         for number in range(1, len(self.logs) + 1):
             if number not in paired and len(self.logs) > 1:

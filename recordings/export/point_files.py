@@ -92,10 +92,8 @@ def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comm
     the number of points, so it is filled in at the end.
     """
     properties = "".join(f"property {_PROPERTIES[dtype[name].str]} {name}\n" for name in dtype.names or ())
-    begin, count = (
-        f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex ".encode("ascii", "replace"),
-        0,
-    )
+    begin = f"ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex ".encode("ascii", "replace")
+    count = 0
     with path.open("wb") as file:
         file.write(begin + f"{count:>10d}\n{properties}end_header\n".encode())
         for part in parts:

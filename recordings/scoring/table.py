@@ -71,11 +71,8 @@ def brief_figures(found: Score) -> list[float]:
     ground = {} if found.terrain is None else found.terrain
     stereo = [seen.get(name, math.nan) for name in ("density", "bad_0.5", "bad_1", "rmse")]
     height = ground["heights"]["0-8 m"]["raw"]["rmse"] if ground else math.nan
-    return [
-        *stereo,
-        height,
-        *(ground["hazards"][name] if ground else math.nan for name in ("false_safe", "false_alarm", "unknown")),
-    ]
+    hazards = ground["hazards"] if ground else {}
+    return [*stereo, height, *(hazards.get(name, math.nan) for name in ("false_safe", "false_alarm", "unknown"))]
 
 
 def brief_row(name: str, values: Sequence[float]) -> tuple[str, ...]:

@@ -51,13 +51,10 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
     visible = visible_cells(simulation, truth, count)
     more = _map_layers(simulation, truth, x, y, elevation, visible, surface.reshape(x.shape))
     layers = {"elevation": elevation, "visible": visible, **more}
-    reason = np.where(on_high_rock, CellReason.STEP, np.where(hazard, CellReason.SLOPE, CellReason.CLEAR)).astype(
-        np.uint8
-    )
-    return (
-        ElevationMap(stamp, layers, step, (-half, -half), LEVEL_FRAME),
-        NavigationMap(stamp, cells, reason.reshape(x.shape), step, (-half, -half), LEVEL_FRAME),
-    )
+    on_slope = np.where(hazard, CellReason.SLOPE, CellReason.CLEAR)
+    reason = np.where(on_high_rock, CellReason.STEP, on_slope).astype(np.uint8).reshape(x.shape)
+    grid = step, (-half, -half), LEVEL_FRAME
+    return ElevationMap(stamp, layers, *grid), NavigationMap(stamp, cells, reason, *grid)
 
 
 def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:

@@ -31,13 +31,8 @@ CURVES = "curves"  # the names of the curves of a panel, which stand beside the 
 SLOWEST = f"{LAYOUT}/slowest"  # those of the slowest stages, which differ from run to run
 LEDGER_CHARS = 80  # of a line of a text log, which the viewer does not wrap
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot
-SHOWN_LAYERS = (
-    "step",
-    "slope",
-    "steepness",
-    "roughness",
-    "variance",
-)  # side by side on the desk `terrain`; the others are tabs
+# Side by side on the desk `terrain`; the others are tabs.
+SHOWN_LAYERS = ("step", "slope", "steepness", "roughness", "variance")
 
 _HIDDEN = rrb.PlotLegend(visible=False)
 Specs = tuple["ViewSpec", ...]

@@ -71,9 +71,7 @@ def _fill(points: Array, scale: float, start: int, table: Array, cubes: Array, k
 def _slot(table: Array, key: int) -> int:
     """The place of a block in a table: its own, or the first free one."""
     mask = table.size - 1
-    slot = (
-        int(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(40)) & mask
-    )  # where all bits of the key count
+    slot = int(np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(40)) & mask  # all bits of the key count
     while table[slot] != EMPTY and table[slot] != key:
         slot = (slot + 1) & mask
     return slot

@@ -140,10 +140,8 @@ def _sweep(
     figures = brief_columns(errors.values())
     counts = {label: changed(found) for label, found in differences.items()}
     for topic in dict.fromkeys(topic for each in counts.values() for topic in each):
-        figures[f"{topic}: changed {'pixels' if 'disparity' in topic else 'cells'}"] = [
-            0.0,
-            *(each.get(topic, 0.0) for each in counts.values()),
-        ]
+        title = f"{topic}: changed {'pixels' if 'disparity' in topic else 'cells'}"
+        figures[title] = [0.0, *(each.get(topic, 0.0) for each in counts.values())]
     return Sweep(*setting, figures) if figures else None
 
 
