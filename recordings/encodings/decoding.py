@@ -6,8 +6,10 @@ another type keeps its own fields.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 from mcap.records import Schema
@@ -15,7 +17,6 @@ from mcap.records import Schema
 from recordings.containers.container import Channel, MessageSchema
 from recordings.discovery.roles import IMAGES
 from recordings.encodings.foxglove import adapter_of, with_header
-from recordings.encodings.json_text import json_decoder
 from recordings.errors import LogError, sentence_of
 from recordings.mcap.chunk import MAX_CHUNK_BYTES, Unpacking
 from recordings.ros1.codec import decoder_for as ros1_decoder
@@ -25,6 +26,9 @@ from recordings.ros2.cdr import full_name, is_packed, plain
 MAX_SCHEMA_BYTES = 1_000_000  # of all schemas of a log without comments; those in use have a fifth of it
 MAX_MESSAGE_BYTES = 4_000_000  # of a message that is no image; none in use has a tenth of it
 ENCODINGS = ("cdr", "ros1", "protobuf", "json")
+# Of a message in JSON; they take far more memory than their text. What is counted may also be in strings.
+_MAX_COUNTS = {"values": (",[", 4_000_000), "objects": ("{", 100_000), "names": (":", 400_000)}
+_SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 
 Decoder = Callable[[bytes | memoryview], Any]
 
@@ -69,6 +73,23 @@ def _plain_decoder(encoding: str, schema: MessageSchema | None) -> Decoder:
         return _protobuf_decoder(schema)
     codec = ros1_decoder if encoding == "ros1" else cdr_decoder
     return codec(schema.name, schema.encoding, schema.text)
+
+
+def json_decoder(data: bytes | memoryview) -> Any:
+    """The message of a JSON object, with attributes. Raises LogError for anything else."""
+    text = bytes(data)
+    for name, (marks, limit) in _MAX_COUNTS.items():
+        if sum(text.count(mark.encode()) for mark in marks) > limit:
+            raise LogError(f"it has more than {limit} {name}")
+    try:
+        message = json.loads(text, object_hook=lambda fields: SimpleNamespace(**fields))
+        if _SURROGATE.search(text):  # a half of one is no character, and no output could contain it
+            json.dumps(json.loads(text), ensure_ascii=False).encode()
+    except (ValueError, RecursionError) as error:
+        raise LogError(f"it is not JSON ({error})") from error
+    if not isinstance(message, SimpleNamespace):
+        raise LogError(f"it is a JSON {type(message).__name__}, not an object")
+    return message
 
 
 def _protobuf_decoder(schema: MessageSchema) -> Decoder:

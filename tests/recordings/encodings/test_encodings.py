@@ -21,8 +21,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from recordings import McapSource
 from recordings.containers.container import Channel, MessageSchema
 from recordings.encodings import decoding
-from recordings.encodings.decoding import MAX_MESSAGE_BYTES, decoder_of
-from recordings.encodings.json_text import json_decoder
+from recordings.encodings.decoding import MAX_MESSAGE_BYTES, decoder_of, json_decoder
 from recordings.errors import LogError
 from recordings.mcap import chunk
 from recordings.ros2.cdr import make
