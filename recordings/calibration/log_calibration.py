@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings.calibration.formats import StereoCalibration, read_calibration
+from recordings.calibration.formats import read_calibration
 from recordings.errors import LogError
 from recordings.source.cameras import CAMERAS, CalibrationTopic, some_image
 from recordings.source.topics import DecodedTopics
@@ -45,19 +45,14 @@ def calibrations_of_files(
     frames = [messages.frame_of(topic) for topic in topics]
     if not all(frames) or frames[0] == frames[1]:
         frames = [f"{side}_camera" for side in CAMERAS]
-    _join(calibration, frames, messages.frame_of(chosen.get("inclinometer", "")) or INCLINOMETER, tree)
+    inclinometer = messages.frame_of(chosen.get("inclinometer", "")) or INCLINOMETER
+    found = (frames[1], calibration.right_in_left), (inclinometer, calibration.camera_from_imu)
+    joined = tree.joined(rigid(frames[0], child, matrix) for child, matrix in found if matrix is not None)
+    tree.edges.update(joined.edges)  # the frames of the files may have other parents in the log
+    tree.calibrated.update(joined.edges)
     models = (_sized(model, messages, topic) for model, topic in zip(calibration.models, topics, strict=True))
     sides = zip(CAMERAS, models, frames, strict=True)
     return {side: CalibrationTopic(shown, model, frame) for side, model, frame in sides}
-
-
-def _join(calibration: StereoCalibration, frames: list[str], inclinometer: str, tree: TransformTree) -> None:
-    """Add the transforms of the files to a tree. Their frames may have other parents in the log."""
-    left, right = frames
-    found = (right, calibration.right_in_left), (inclinometer, calibration.camera_from_imu)
-    joined = tree.joined(rigid(left, child, matrix) for child, matrix in found if matrix is not None)
-    tree.edges.update(joined.edges)
-    tree.calibrated.update(joined.edges)
 
 
 def _sized(model: CameraModel, messages: DecodedTopics, topic: str) -> CameraModel:
