@@ -15,16 +15,7 @@ from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.importers.files import from_date, numbers_of, read_rows
 from recordings.importers.pairing import pair_images
-from recordings.importers.recording import (
-    BASE,
-    IMU,
-    ImagePair,
-    ImportedRecording,
-    Logged,
-    beside,
-    common_size,
-    rectified_models,
-)
+from recordings.importers.recording import BASE, IMU, ImagePair, ImportedRecording, Logged, common_size
 from recordings.importers.rig import INCLINOMETER, LENS, Rig
 from recordings.importers.track import upright
 from recordings.ros2.tilt_from_msg import up_of
@@ -58,11 +49,9 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
         rig.need(f"a set with images of {width}x{height}", *LENS)
     focal, centre = LENSES.get(width, (1.0, (0.0, 0.0)))
     camera = rig.camera((width, height), focal, BASELINE, centre)
-    return ImportedRecording(
-        rectified_models(camera), True, pairs,
-        [rig.mount, beside(camera), Transform(BASE, IMU, np.eye(3), np.zeros(3))],
-        [_tilts(folder, rig, stamps)], notes=notes,
-    )  # fmt: skip
+    inclinometer = Transform(BASE, IMU, np.eye(3), np.zeros(3))
+    tilts = [_tilts(folder, rig, stamps)]
+    return ImportedRecording.of_rectified(camera, pairs, rig.mount, inclinometer, sensors=tilts, notes=notes)
 
 
 def _pairs(source: Path, stamps: dict[int, int], notes: list[str]) -> list[ImagePair]:

@@ -22,9 +22,7 @@ from recordings.importers.recording import (
     ImagePair,
     ImportedRecording,
     Logged,
-    beside,
     common_size,
-    rectified_models,
     tilts_of,
 )
 from recordings.importers.rig import Rig
@@ -52,10 +50,9 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
         raise LogError(f"{source} contains no pair of images in image_{cameras[0]} and image_{cameras[1]}")
     projections = [_projections(source / "calib.txt")[camera] for camera in cameras]
     camera, shift = stereo_camera(projections, common_size(pairs))
-    poses = next(
-        (path for path in (source.resolve().parents[1] / "poses" / f"{source.resolve().name}.txt", source / "poses.txt")
-         if path.exists()), None,
-    )  # fmt: skip
+    sequence = source.resolve()
+    places = sequence.parents[1] / "poses" / f"{sequence.name}.txt", source / "poses.txt"
+    poses = next((path for path in places if path.exists()), None)
     if poses is None:
         notes.append("the files contain neither poses nor tilt: the car is assumed level in every frame")
         level = np.array([0.0, 0.0, 0.0, 1.0])
@@ -64,9 +61,7 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
         notes.append(f"the tilt is that of the rig file, rotated by the true poses in {poses.name}")
         track = _track(poses, stamps, mount, shift)
         tilts = tilts_of(track, [pair.stamp for pair in pairs])
-    return ImportedRecording(
-        rectified_models(camera), True, pairs, [mount, beside(camera)], [tilts], track, notes=notes
-    )  # fmt: skip
+    return ImportedRecording.of_rectified(camera, pairs, mount, sensors=[tilts], truth=track, notes=notes)
 
 
 def existing(listed: list[ImagePair], file: str, notes: list[str]) -> list[ImagePair]:

@@ -13,16 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.importers.files import nanoseconds, numbers_of, read_lines, rotation_of
-from recordings.importers.recording import (
-    BASE,
-    ImagePair,
-    ImportedRecording,
-    beside,
-    common_size,
-    paired,
-    rectified_models,
-    tilts_of,
-)
+from recordings.importers.recording import BASE, ImagePair, ImportedRecording, common_size, paired, tilts_of
 from recordings.importers.rig import AXES, Rig
 from recordings.importers.track import Track
 
@@ -43,10 +34,8 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     pairs.sort(key=lambda pair: pair.stamp)
     size, track = common_size(pairs), _track(source / POSES, rig)
     camera = rig.camera(size, FOCAL * size[0] / WIDTH, BASELINE)
-    return ImportedRecording(
-        rectified_models(camera), True, pairs, [rig.mount, beside(camera)],
-        [tilts_of(track, track.stamps.tolist())], track, notes=notes,
-    )  # fmt: skip
+    tilts = [tilts_of(track, track.stamps.tolist())]
+    return ImportedRecording.of_rectified(camera, pairs, rig.mount, sensors=tilts, truth=track, notes=notes)
 
 
 def _track(path: Path, rig: Rig) -> Track:

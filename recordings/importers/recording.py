@@ -77,6 +77,13 @@ class ImportedRecording:
     metadata: tuple[str, Mapping[str, str]] | None = None
     notes: list[str] = field(default_factory=list)
 
+    @classmethod
+    def of_rectified(
+        cls, camera: StereoCamera, pairs: Sequence[ImagePair], mount: Transform | None, *others: Transform, **rest: Any
+    ) -> ImportedRecording:
+        """The recording of rectified pairs. mount: base_link <- left camera; others: of sensors; rest: as above."""
+        return cls(rectified_models(camera), True, pairs, [mount, beside(camera), *others], **rest)
+
 
 def write_recording(
     recording: ImportedRecording,

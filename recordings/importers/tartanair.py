@@ -23,10 +23,8 @@ from recordings.importers.recording import (
     ImagePair,
     ImportedRecording,
     Logged,
-    beside,
     common_size,
     paired,
-    rectified_models,
     tilts_of,
 )
 from recordings.importers.rig import Rig
@@ -63,9 +61,8 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
     size = common_size(pairs)
     camera = rig.camera(size, size[0] / 2, BASELINE)
     depths = [next(iter(source.glob(f"depth_{left}/{pair.left.stem}_depth.*")), None) for pair in pairs]
-    return ImportedRecording(
-        rectified_models(camera), True, pairs, [rig.mount, beside(camera)],
-        [tilts_of(track, [pair.stamp for pair in pairs])], track, notes=notes,
+    return ImportedRecording.of_rectified(
+        camera, pairs, rig.mount, sensors=[tilts_of(track, [pair.stamp for pair in pairs])], truth=track, notes=notes,
         more=lambda number: _truth(pairs[number].stamp, camera, depths[number]),
     )  # fmt: skip
 
