@@ -18,7 +18,6 @@ from recordings.discovery.roles import (
     Remedy,
     Topic,
     names_of,
-    not_there,
 )  # fmt: skip
 from recordings.discovery.tilt import find_tilt
 from recordings.errors import LogError
@@ -69,7 +68,7 @@ def _find_pose(
     if settings.odometry is not None:
         candidates = poses + [topic for topic in moving if topic.messages]
         if settings.odometry not in {topic.name for topic in candidates}:
-            found.refuse("odometry", "odometry", not_there("odometry", settings.odometry, "pose", candidates))
+            found.refuse_topic("odometry", "odometry", settings.odometry, "pose", candidates)
         elif settings.odometry in {topic.name for topic in moving} and (
             why := _no_pose_reason(messages, settings.odometry, settings.base_frame)
         ):

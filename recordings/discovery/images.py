@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from itertools import takewhile
 
-from recordings.discovery.roles import IMAGES, INFO, DiscoveredTopics, Remedy, Topic, names_of, not_there
+from recordings.discovery.roles import IMAGES, INFO, DiscoveredTopics, Remedy, Topic, names_of
 from recordings.source.settings import LogSettings
 from recordings.source.topics import DecodedTopics
 
@@ -32,7 +32,7 @@ def find_images(topics: Sequence[Topic], settings: LogSettings, found: Discovere
     names = {topic.name for topic in images}
     for side, given in (("left", settings.left), ("right", settings.right)):
         if given is not None and given not in names:
-            found.refuse(side, side, not_there(side, given, "image", images))
+            found.refuse_topic(side, side, given, "image", images)
             other = settings.right if side == "left" else settings.left
             found.offer(side, side, [topic.name for topic in images if topic.name != other])
         elif given is not None and settings.left == settings.right:
@@ -94,7 +94,7 @@ def find_info(
         if given in {topic.name for topic in infos}:
             found.chosen[f"{side}_info"] = given
         else:
-            found.refuse(side, f"{side}_info", not_there(f"{side}_info", given, "CameraInfo", infos))
+            found.refuse_topic(side, f"{side}_info", given, "CameraInfo", infos)
             found.offer(side, f"{side}_info", [topic.name for topic in infos], f"if it is that of {image}")
         return
     base = _TRANSPORTS.sub("", image)

@@ -64,14 +64,15 @@ class DiscoveredTopics:
         """Note that a stream is missing because of a user's setting; nothing replaces it."""
         self.missing[stream] = self.refused[setting] = why
 
+    def refuse_topic(self, stream: str, setting: str, given: str, kind: str, topics: Sequence[Topic]) -> None:
+        """The same of a setting whose topic, `given`, is none of those that it could have. kind: of these, in words."""
+        listed = f"its {kind} topics are {names_of(topics)}" if topics else f"it has no {kind} topic that can be decoded"
+        why = f"the source's '{setting}' is set to {given}, which is not a suitable topic of the log ({listed})"
+        self.refuse(stream, setting, why)
+
     def offer(self, stream: str, setting: str, topics: Sequence[str], condition: str = "") -> None:
         """Note the topics that a setting could have."""
         self.remedies.setdefault(stream, []).extend(Remedy({setting: topic}, condition) for topic in topics)
-
-
-def not_there(setting: str, given: str, kind: str, topics: Sequence[Topic]) -> str:
-    listed = f"its {kind} topics are {names_of(topics)}" if topics else f"it has no {kind} topic that can be decoded"
-    return f"the source's '{setting}' is set to {given}, which is not a suitable topic of the log ({listed})"
 
 
 def names_of(topics: Sequence[Topic]) -> str:

@@ -19,7 +19,6 @@ from recordings.discovery.roles import (
     TiltKind,
     Topic,
     names_of,
-    not_there,
 )  # fmt: skip
 from recordings.inertial.imu_content import imu_content
 from recordings.source.settings import LogSettings
@@ -38,7 +37,7 @@ def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedT
         topic = next((topic for topic in topics if topic.name == given), None)
         if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
             candidates = [topic for topic in topics if topic.schema in (*TILTS, BARE_TILT)]
-            found.refuse("inclinometer", setting, not_there(setting, given, "tilt", candidates))
+            found.refuse_topic("inclinometer", setting, given, "tilt", candidates)
             found.offer("inclinometer", "inclinometer", [t.name for t in candidates if t.schema in TILTS])
         elif found.tilt == TiltKind.ORIENTATION and topic.schema not in TILTS:
             found.refuse("inclinometer", "inclinometer", _undefined(topic))
@@ -118,7 +117,7 @@ def _find_gyroscope(
     imus, own = [topic for topic in topics if topic.schema == IMU], found.chosen["inclinometer"]
     if settings.gyroscope is not None:
         if settings.gyroscope not in {topic.name for topic in imus}:
-            found.refuse("inclinometer", "gyroscope", not_there("gyroscope", settings.gyroscope, "Imu", imus))
+            found.refuse_topic("inclinometer", "gyroscope", settings.gyroscope, "Imu", imus)
             return
         if settings.accelerations is None and not _accelerates(own, imus, messages):
             own = settings.gyroscope if settings.inclinometer is None else own
