@@ -66,7 +66,8 @@ class DiscoveredTopics:
 
     def refuse_topic(self, stream: str, setting: str, given: str, kind: str, topics: Sequence[Topic]) -> None:
         """The same of a setting whose topic, `given`, is none of those that it could have. kind: of these, in words."""
-        listed = f"its {kind} topics are {names_of(topics)}" if topics else f"it has no {kind} topic that can be decoded"
+        none = f"it has no {kind} topic that can be decoded"
+        listed = f"its {kind} topics are {names_of(topics)}" if topics else none
         why = f"the source's '{setting}' is set to {given}, which is not a suitable topic of the log ({listed})"
         self.refuse(stream, setting, why)
 
