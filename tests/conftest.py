@@ -158,6 +158,13 @@ def with_broken(log: Path, *chunks: Any) -> Path:
     return damaged
 
 
+def patch(path: Path, place: int, data: bytes) -> None:
+    """Replace the bytes at a place of a file."""
+    with path.open("r+b") as file:
+        file.seek(place)
+        file.write(data)
+
+
 def write_mcap(
     out: Path,
     rows: Iterable[Row],

@@ -1,4 +1,4 @@
-"""A disk that is full, as a limit of the size of files."""
+"""Limits of a process: of the size of files, as on a full disk, and of memory."""
 
 import resource
 from collections.abc import Iterator
@@ -14,3 +14,11 @@ def file_size_limited(number: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@contextmanager
+def memory_limited(kilobytes: int) -> Iterator[None]:
+    """The process never needs so much memory more."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < kilobytes

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from zstandard import ZstdCompressor
 
 from recordings import McapSource
+from recordings.containers.container import LostMessage, RawMessage
 from recordings.inventory.description import describe
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
@@ -165,6 +166,15 @@ def refused_in(path: Path, **settings: Any) -> dict[str, str]:
 def losses_in(events: Iterable[Event]) -> list[tuple[int, str, str]]:
     """The losses among events, with their sentences."""
     return [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]
+
+
+def parted(messages: Iterable[RawMessage | LostMessage]) -> tuple[list[RawMessage], list[str]]:
+    """The sound ones of raw messages, and the reasons of the lost ones."""
+    found = list(messages)
+    return (
+        [item for item in found if isinstance(item, RawMessage)],
+        [item.reason for item in found if isinstance(item, LostMessage)],
+    )
 
 
 def inventory_of(path: Path, slop: int = 5_000_000, max_gap: int = 200_000_000) -> dict[str, Any]:

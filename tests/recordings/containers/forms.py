@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 from recordings.ros2.cdr import standard_types
-from tests.conftest import mcap_rows
+from tests.conftest import mcap_rows, patch
 from tests.recordings.encodings.rewritten import ROS1, as_ros1
 
 Row = tuple[str, str, int, bytes]  # topic, type, log time, data
@@ -74,8 +74,5 @@ def _as_ros1(kind: str, data: bytes) -> bytes:
 
 def without_index(bag: Path) -> Path:
     """A bag whose header does not say where the index is, as a stopped recorder leaves it; all chunks are whole."""
-    content = bytearray(bag.read_bytes())
-    place = content.index(b"index_pos=") + len(b"index_pos=")
-    content[place : place + 8] = bytes(8)
-    bag.write_bytes(content)
+    patch(bag, bag.read_bytes().index(b"index_pos=") + len(b"index_pos="), bytes(8))
     return bag

@@ -1,5 +1,6 @@
 """rosbag2 databases and ROS 1 bags, sound and damaged: what can be read is read, the rest is reported."""
 
+import os
 import shlex
 import sqlite3
 import subprocess
@@ -15,8 +16,9 @@ from rosbags.rosbag2 import StoragePlugin
 from recordings.containers.container import LostMessage, OpenChunks, within
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
+from tests.conftest import patch
 from tests.recordings.containers.forms import rows_of, without_index, write_bag, write_rosbag2
-from tests.recordings.sample_log import INFOS, LEFT, RIGHT, TILT, essences, items_of
+from tests.recordings.sample_log import INFOS, LEFT, RIGHT, TILT, essences, items_of, parted
 
 
 @pytest.fixture
@@ -34,14 +36,9 @@ def edit(database, *statements):
 
 def read(path):
     """The sound messages as (topic, log time, data), and the reasons of the lost ones."""
-    sound, lost = [], []
     with open_recording(path) as log:
-        for item in log.files[0].messages(set(log.channels)):
-            if isinstance(item, LostMessage):
-                lost.append(item.reason)
-            else:
-                sound.append((log.channels[item.channel].topic, item.log_time, bytes(item.data)))
-    return sound, lost
+        sound, lost = parted(log.files[0].messages(set(log.channels)))
+        return [(log.channels[item.channel].topic, item.log_time, bytes(item.data)) for item in sound], lost
 
 
 def without_types(rows):
@@ -98,15 +95,14 @@ def test_rows_that_a_damaged_page_has_lost_are_reported(database, sample):
             "SELECT rootpage, page_size FROM sqlite_master, pragma_page_size() WHERE name = 'messages'"
         ).fetchone()
     connection.close()
-    content = bytearray(database.read_bytes())
+    content = database.read_bytes()
 
     def number(at, size):
         return int.from_bytes(content[at : at + size], "big")
 
     page = page_bytes * (number(page_bytes * (root - 1) + 8, 4) - 1)  # the last page of rows
     rows, records = number(page + 3, 2), number(page + 5, 2)
-    content[page + records : page + page_bytes] = bytes(page_bytes - records)
-    database.write_bytes(content)
+    patch(database, page + records, bytes(page_bytes - records))
     kept = without_types(rows_of(sample))[:-rows]
     reason = f"the file is truncated or damaged (rows without a topic or a time); intact: {len(kept)} messages"
     assert read(database) == (kept, [reason])
@@ -165,8 +161,9 @@ def test_a_database_without_messages_is_refused(database, statements, sentence):
 
 
 @pytest.mark.parametrize("compression", [None, *Bag1Writer.CompressionFormat])
-def test_a_bag_has_the_messages_and_schemas_that_were_written(sample, tmp_path, compression):
+def test_a_ros_1_bag_is_the_same_log_with_the_schemas_of_ros_1(sample, whole, tmp_path, compression):
     path = write_bag(rows_of(sample), tmp_path / "log.bag", compression)
+    assert essences(items_of(path)) == essences(whole)
     sound, lost = read(path)
     assert [(topic, time) for topic, time, _ in sound] == [(topic, time) for topic, _, time, _ in rows_of(sample)]
     assert lost == []
@@ -183,10 +180,7 @@ def test_a_broken_chunk_of_a_bag_loses_its_messages(sample, tmp_path):
     rows = [(topic, kind, rows[0][2] + 1000 * number, data) for number, (topic, kind, _, data) in enumerate(rows)]
     path = write_bag(rows, tmp_path / "log.bag", Bag1Writer.CompressionFormat.LZ4)
     sound, _ = read(path)
-    content = bytearray(path.read_bytes())
-    place = content.index(b"\x04\x22\x4d\x18")  # the first bytes of the first chunk
-    content[place] ^= 0xFF
-    path.write_bytes(content)
+    patch(path, path.read_bytes().index(b"\x04\x22\x4d\x18"), b"\xff")  # the first byte of the first chunk
     kept, lost = read(path)
     assert len(kept) + len(lost) == len(sound) == len(rows) > len(kept) > 0
     assert kept == sound[len(lost) :]
@@ -210,13 +204,13 @@ def test_a_bag_of_a_stopped_recorder_is_read_without_its_index(sample, tmp_path,
 
 def test_the_last_chunk_of_a_stopped_recorder_has_no_stated_size(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
-    sound, content = read(path)[0], bytearray(path.read_bytes())
+    sound, content = read(path)[0], path.read_bytes()
     with Reader(path) as bag:
         place, chunk = max(bag.chunks.items())
-    for name in (content.index(b"size=", place) + len(b"size="), chunk.datapos - 4):
-        content[name : name + 4] = bytes(4)
+    for size in (content.index(b"size=", place) + len(b"size="), chunk.datapos - 4):
+        patch(path, size, bytes(4))
     last = content.rindex(b"time=", chunk.datapos, chunk.datapos + chunk.datasize)
-    path.write_bytes(content[: last + 100])
+    os.truncate(path, last + 100)
     kept, lost = read(path)
     assert kept == sound[:-1]
     assert len(lost) == 1
@@ -226,19 +220,15 @@ def test_the_last_chunk_of_a_stopped_recorder_has_no_stated_size(sample, tmp_pat
 def test_messages_of_an_unknown_connection_of_a_bag_are_reported(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
     sound, content = read(path)[0], path.read_bytes()
-    place = content.index(b"conn=", content.index(b"op=\x02")) + len(b"conn=")  # of the first message
-    path.write_bytes(content[:place] + b"\x63" + content[place + 1 :])
-    kept, lost = read(without_index(path))
-    assert kept == sound[1:]
-    assert lost == ["1 message of an undefined connection cannot be read"]
+    patch(path, content.index(b"conn=", content.index(b"op=\x02")) + len(b"conn="), b"\x63")  # of the first message
+    assert read(without_index(path)) == (sound[1:], ["1 message of an undefined connection cannot be read"])
 
 
 def test_a_bag_without_messages_is_refused(sample, tmp_path):
     path = write_bag(rows_of(sample), tmp_path / "log.bag")
-    content = path.read_bytes()
     why = r"log\.bag cannot be read \(Bag is not indexed\); record it again, as no message is found"
-    for size in (4109, 4200):  # after the header, and in the first record of the first chunk
-        path.write_bytes(content[:size])
+    for size in (4200, 4109):  # in the first record of the first chunk, and after the header
+        os.truncate(path, size)
         with pytest.raises(LogError, match=why):
             open_recording(without_index(path))
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rosbags.rosbag1 import Reader as Bag1Reader
 from rosbags.rosbag2 import Reader as Bag2Reader
@@ -13,7 +14,9 @@ from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
+from recordings.inventory.text import format_description
 from tests.conftest import data_folder
+from tests.recordings.sample_log import inventory_of, items_of
 
 Message = tuple[int, str, bytes]  # log time, topic, data
 
@@ -87,3 +90,26 @@ def test_what_is_no_log_is_refused_in_a_sentence(name, sentence):
     with pytest.raises(LogError) as refused:
         open_recording(path)
     assert str(refused.value).startswith(f"{path} {sentence}")
+
+
+def test_every_real_log_is_described_or_refused():
+    refused = []
+    paths = [path for path in sorted(data_folder("logs").rglob("*")) if path.suffix in (".mcap", ".db3", ".bag")]
+    for path in paths:
+        try:
+            text = format_description(json.loads(json.dumps(inventory_of(path))))
+        except LogError as error:
+            refused.append(str(error))
+            continue
+        assert "missing: left" in text
+        assert not [item for _, _, item in items_of(path) if isinstance(item, Exception)], path
+    assert len(paths) >= 232
+    assert len(refused) <= len(paths) // 10
+    assert all("contains no messages" in text or "is empty" in text for text in refused)
+
+
+def test_the_field_log_has_its_tilt_at_ten_hertz():
+    path = data_folder("logs/field") / "SO_bag_0.mcap"
+    tilts = [item for _, stream, item in items_of(path) if stream == "inclinometer"]
+    assert len(tilts) == 161
+    assert all(abs(np.linalg.norm(tilt.up) - 1) < 1e-9 for tilt in tilts)

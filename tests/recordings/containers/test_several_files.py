@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
-from rosbags.rosbag1 import Writer as Bag1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from recordings import McapSource
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from tests.conftest import slow
-from tests.recordings.containers.forms import rows_of, write_bag, write_rosbag2
+from tests.recordings.containers.forms import rows_of, write_rosbag2
 from tests.recordings.sample_log import PERIOD, START, essences, inventory_of, items_of
 
 PLUGINS = [StoragePlugin.MCAP, StoragePlugin.SQLITE3]
@@ -42,11 +41,6 @@ def test_a_split_recording_is_the_same_log_as_one_file(sample, whole, tmp_path, 
     assert read(folder) == essences(whole)
     if mode != CompressionMode.FILE:
         assert set(read(sorted(folder.iterdir(), reverse=True))) == set(essences(whole))
-
-
-@pytest.mark.parametrize("compression", [None, *Bag1Writer.CompressionFormat])
-def test_a_ros_1_bag_is_the_same_log(sample, whole, tmp_path, compression):
-    assert read(write_bag(rows_of(sample), tmp_path / "log.bag", compression)) == essences(whole)
 
 
 @pytest.mark.parametrize("plugin", PLUGINS)

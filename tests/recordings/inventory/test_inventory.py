@@ -1,6 +1,7 @@
 """The inventory of a log for `roverflow info`."""
 
 import json
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from recordings.inventory.description import Damage, describe
 from recordings.inventory.text import format_description
 from recordings.mcap.file import McapFile
 from stages.data import Transform
-from tests.conftest import rewrite
+from tests.conftest import patch, rewrite
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -231,7 +232,7 @@ def test_undecodable_topics_are_listed_once(tmp_path):
 
 def test_damage_is_reported(tmp_path):
     path = rewrite(write_sample(tmp_path / "sample.mcap"), tmp_path / "log.mcap", chunk_size=500)
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    os.truncate(path, path.stat().st_size // 2)
     description = inventory_of(path)
     assert not description["indexed"]
     assert "the log is truncated or damaged at byte" in description["damage"][0]
@@ -255,12 +256,11 @@ def test_a_large_log_is_described_by_the_starts_of_its_messages(sample, tmp_path
 
 def test_only_the_starts_of_the_images_of_a_large_log_are_read(sample, tmp_path, monkeypatch):
     path = rewrite(sample, tmp_path / "log.mcap", compression=CompressionType.NONE)
-    content = bytearray(path.read_bytes())
     with McapFile(path) as log:
         (image,) = (item for item in log.messages(log.channels_of([LEFT]), START, START + PERIOD // 2))
-    at = content.index(bytes(image.data))
-    content[at + len(image.data) // 2] ^= 0xFF  # the CRC of the only chunk does not match any more
-    path.write_bytes(content)
+        data = bytes(image.data)
+    middle = len(data) // 2  # the CRC of the only chunk does not match any more
+    patch(path, path.read_bytes().index(data) + middle, bytes([data[middle] ^ 0xFF]))
     with open_recording(path) as log:
         heads = list(log.heads(log.channels_of([LEFT, RIGHT])))
     assert [peek_stamp(head.data) for head in heads] == [START + n // 2 * PERIOD for n in range(2 * FRAMES)]
