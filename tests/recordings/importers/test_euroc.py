@@ -129,20 +129,6 @@ def test_cameras_in_the_wrong_order_are_refused(recording, tmp_path, refused):
     assert "cam1 is the left camera by the calibration; exchange the names of cam0 and cam1" in why
 
 
-@pytest.mark.parametrize(("name", "old", "new", "words"), [
-    ("imu0/data.csv", "1700086", "1.7E+18", "spreadsheets round stamps"),
-    ("cam0/data.csv", ",", ";", "has only 1 of 2 columns"),
-    ("cam1/sensor.yaml", "pinhole", "omni", "the camera model 'omni'"),
-    ("imu0/data.csv", None, None, "cannot read"),
-    ("cam0/sensor.yaml", None, None, "give --calibration"),
-])  # fmt: skip
-def test_a_spoilt_file_is_named_in_one_sentence(recording, tmp_path, refused, name, old, new, words):
-    path = shutil.copytree(recording[0], tmp_path / "room") / "mav0" / name
-    path.unlink() if old is None else path.write_bytes(path.read_bytes().replace(old.encode(), new.encode()))
-    assert words in refused("import", "euroc", tmp_path / "room", tmp_path / "log.mcap")
-    assert [path.name for path in tmp_path.iterdir()] == ["room"]
-
-
 def test_a_recording_without_readings_and_whole_images_is_refused(recording, tmp_path, refused):
     folder = shutil.copytree(recording[0], tmp_path / "room") / "mav0"
     shutil.rmtree(folder / "state_groundtruth_estimate0")
