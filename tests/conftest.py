@@ -4,7 +4,7 @@ import fcntl
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,11 +42,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def fast_result(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The traverse, run through the fastest pipeline."""
-
-    def run(out: Path) -> None:
-        assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
-
-    return made_once(tmp_path_factory, "fast/out.mcap", run)
+    return made_once(tmp_path_factory, "fast/out.mcap", lambda out: run_fast(out, traverse))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -104,6 +100,13 @@ def data_folder(name: str) -> Path:
 def roverflow(*arguments: object) -> int:
     """What the command line makes of these arguments."""
     return main([str(argument) for argument in arguments])
+
+
+def run_fast(out: Path, log: Path | Sequence[Path], *options: object, code: int = 0) -> Path:
+    """The result of a run of the fastest pipeline, without a recording."""
+    logs = [log] if isinstance(log, Path) else log
+    assert roverflow("run", *logs, "-p", "fast", *SMALL, "-o", out, "--no-rrd", *options) == code
+    return out
 
 
 @pytest.fixture
@@ -221,6 +224,13 @@ def rewrite(
                 yield topic, encoding, (name, form, text), time(topic, log_time), changed
 
     return write_mcap(out, rows(), **options)
+
+
+def halves(log: Path, folder: Path) -> list[Path]:
+    """The log as the two files of a recording in a folder."""
+    rows = mcap_rows(log)
+    parts = rows[: len(rows) // 2], rows[len(rows) // 2 :]
+    return [write_mcap(folder / f"bag_{number}.mcap", part) for number, part in enumerate(parts)]
 
 
 def edit_of(topic: str, schema: str, edit: Callable[[int, Any], object]) -> Callable[[str, int, bytes], bytes]:

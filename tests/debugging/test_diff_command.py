@@ -8,7 +8,7 @@ import pytest
 from flow.contracts import FrameRecord, Loss, LossReason
 from recordings import McapSink
 from recordings.mcap.file import iter_decoded
-from tests.conftest import FRAMES, SMALL, chunks_of, roverflow, slow, with_broken
+from tests.conftest import FRAMES, SMALL, chunks_of, run_fast, slow, with_broken
 
 
 @pytest.fixture(scope="module")
@@ -16,10 +16,8 @@ def variant_of(traverse, tmp_path_factory):
     """Makes a result of the traverse with some settings."""
 
     def make(*changes):
-        out = tmp_path_factory.mktemp("variant") / "out.mcap"
-        settings = [word for change in changes for word in ("--set", change)]
-        assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", *settings) == 0
-        return out
+        settings = [f"--set={change}" for change in changes]
+        return run_fast(tmp_path_factory.mktemp("variant") / "out.mcap", traverse, *settings)
 
     return make
 
@@ -59,9 +57,8 @@ def test_a_difference_is_also_a_message_that_only_one_result_has(fast_result, va
 
 
 def test_results_of_other_logs_show_the_digests_of_the_logs(traverse, fast_result, tmp_path, said):
-    log, out = tmp_path / traverse.name, tmp_path / "out.mcap"
-    log.write_bytes(traverse.read_bytes() + b"\0")  # a byte that is reported as not read
-    assert roverflow("run", log, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
+    (log := tmp_path / traverse.name).write_bytes(traverse.read_bytes() + b"\0")  # a byte that is reported as not read
+    out = run_fast(tmp_path / "out.mcap", log, code=3)
     facts = json.loads(said(3, "diff", fast_result, out, "--json").out)["facts"]
     assert list(facts) == ["log_digest"]
     one, other = facts["log_digest"]
@@ -82,12 +79,6 @@ def test_a_loss_of_the_last_frame_differs_beside_the_findings_of_the_end(tmp_pat
     assert said(0, "diff", one, same).out.startswith("equal: ")
     topics = json.loads(said(3, "diff", one, other, "--json").out)["topics"]
     assert (topics["/nav/diagnostics"]["messages"], topics["/nav/diagnostics"]["differing"]) == (2, 1)
-
-
-def test_copied_inputs_are_not_compared(traverse, fast_result, tmp_path, said):
-    out = tmp_path / "out.mcap"
-    assert roverflow("run", traverse, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
-    assert "equal: all " in said(0, "diff", out, fast_result).out
 
 
 def test_a_log_without_results_is_refused(traverse, fast_result, tmp_path, refused):

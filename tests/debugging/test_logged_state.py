@@ -11,13 +11,13 @@ from flow.cli.debugging.variants import merged
 from flow.cli.debugging.what_if import run_variants
 from recordings.results import read_result
 from stages import FuseRegion
-from tests.conftest import SMALL, an_hour_later, edit_of, rewrite, roverflow, slow
+from tests.conftest import SMALL, an_hour_later, edit_of, rewrite, run_fast, slow
 
 AT = 1.5  # s, the last frame
 HEIGHT_STEP = 1 / 1024  # m, to which the log rounds heights
 POSE = "nav_msgs/msg/Odometry"
 END = 1 << 62  # ns, after all stamps
-EVERY_MAP = ("-p", "fast", *SMALL, "--set", "regional_elevation.step=0 m")
+EVERY_MAP = ("--set", "regional_elevation.step=0 m")
 
 
 @pytest.fixture(scope="module", params=["visual odometry", *slow("logged poses")])
@@ -27,9 +27,7 @@ def run(request, traverse, tmp_path_factory):
     if request.param == "visual odometry":
         log = tmp_path_factory.mktemp("visual") / "log.mcap"
         rewrite(traverse, log, lambda topic, _, data: None if topic == "/odometry" else data)
-    out = tmp_path_factory.mktemp("result") / "out.mcap"
-    assert roverflow("run", log, *EVERY_MAP, "-o", out, "--no-rrd") == 0
-    return log, out
+    return log, run_fast(tmp_path_factory.mktemp("result") / "out.mcap", log, *EVERY_MAP)
 
 
 def last_frame(path):
@@ -48,7 +46,7 @@ def common(terrain, other):
 
 def tried(log, pipeline, folder):
     """The last frame of the log, run with the state of a result log, or of no other frame; and the number before it."""
-    changes = () if isinstance(pipeline, Path) else EVERY_MAP[3::2]
+    changes = () if isinstance(pipeline, Path) else (SMALL[1], EVERY_MAP[1])
     paths, _, part, _ = run_variants([log], pipeline, {"A": changes}, folder, at=AT, frames=1, before=0, workers=2)
     return last_frame(paths["A"]), part.before
 
@@ -140,9 +138,9 @@ def test_a_state_that_variants_share_is_made_once(run, monkeypatch):
     (("--profile", "foxglove"), "has results in Foxglove's messages; run the log again with --profile ros2\n"),
 ])  # fmt: skip
 def test_a_result_without_the_state_of_each_frame_is_refused(traverse, option, sentence, tmp_path, refused):
-    result, rest = tmp_path / "out.mcap", ("-o", tmp_path / "try.rrd")
-    assert roverflow("run", traverse, "-p", "fast", *SMALL, "--end", 0.7, *option, "-o", result, "--no-rrd") == 0
-    assert f"{result} {sentence}" in refused("try", traverse, "--at", 1, "--result", result, *SMALL, *rest)
+    result = run_fast(tmp_path / "out.mcap", traverse, "--end", 0.7, *option)
+    rest = *SMALL, "-o", tmp_path / "try.rrd"
+    assert f"{result} {sentence}" in refused("try", traverse, "--at", 1, "--result", result, *rest)
 
 
 def test_the_result_of_another_log_or_of_another_pipeline_is_refused(traverse, fast_result, tmp_path, refused):

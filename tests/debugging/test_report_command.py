@@ -15,7 +15,7 @@ from recordings.reporting.run_facts import read_facts
 from recordings.ros2 import to_msg as ros2
 from recordings.sinks.colormaps import elevation_limits
 from stages.data import ElevationMap
-from tests.conftest import SMALL, rewrite, roverflow
+from tests.conftest import SMALL, rewrite, roverflow, run_fast
 
 VOID = {"meta", "img", "link", "line", "circle", "polyline"}
 
@@ -124,9 +124,9 @@ def test_a_result_beside_another_is_drawn_at_the_same_stamps(result):
 
 
 def test_losses_are_listed_and_a_foreign_file_is_kept(traverse, tmp_path, refused):
-    right, out = "/stereo/right/image_rect_color", tmp_path / "out.mcap"
+    right = "/stereo/right/image_rect_color"
     cut = rewrite(traverse, tmp_path / "cut.mcap", lambda topic, at, data: None if (topic, at) == (right, 1) else data)
-    assert roverflow("run", cut, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 3
+    out = run_fast(tmp_path / "out.mcap", cut, code=3)
     assert roverflow("report", out) == 0
     row = f"<td>left</td><td>{moment(1700086400513000000)}</td><td>unmatched</td>"
     assert row in out.with_suffix(".html").read_text()

@@ -13,7 +13,7 @@ from flow.cli import replay
 from flow.cli.debugging import verify
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import MessageKind, Ros2Writer
-from tests.conftest import SMALL, chunks_of, edit_of, mcap_rows, rewrite, roverflow, with_broken
+from tests.conftest import chunks_of, edit_of, mcap_rows, rewrite, roverflow, run_fast, with_broken
 
 TOPICS = "13 topics"
 OWN = """
@@ -34,9 +34,7 @@ def short(traverse, tmp_path_factory):
     log = Path(shutil.copy(traverse, tmp_path_factory.mktemp("verify")))
 
     def make(name, *words):
-        out = log.with_name(name)
-        assert roverflow("run", log, "-p", "fast", *SMALL, "--end", "1.2", "-o", out, "--no-rrd", *words) == 0
-        return out
+        return run_fast(log.with_name(name), log, "--end", "1.2", *words)
 
     return make
 
@@ -141,8 +139,8 @@ def test_a_calibration_that_changed_since_is_named(traverse, tmp_path, said):
     log, info = tmp_path / "log.mcap", tmp_path / "right.yaml"
     shutil.copy(traverse, log)
     files = calibrations_of(traverse, tmp_path)
-    out, change = tmp_path / "out.mcap", f"source.calibration=[{','.join(map(str, files))}]"
-    assert roverflow("run", log, "-p", "fast", *SMALL, "--set", change, "--end", "1.2", "-o", out, "--no-rrd") == 0
+    change = f"--set=source.calibration=[{','.join(map(str, files))}]"
+    out = run_fast(tmp_path / "out.mcap", log, change, "--end", "1.2")
     assert "the same in a second run" in said(0, "verify", out).out
     content = yaml.safe_load(info.read_text())
     content["projection_matrix"]["data"][3] *= 1.2

@@ -21,7 +21,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell
-from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, mcap_rows, rewrite, roverflow, slow, write_mcap
+from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, halves, rewrite, roverflow, run_fast, slow
 
 AT = 1.0
 OWN_STAGE = """
@@ -75,10 +75,9 @@ def test_the_change_that_would_turn_a_verdict_turns_it(traverse, fast_result, st
     (x, y), *_ = places(fast_result, stamp, state, 3)
     found = why(fast_result, AT, cell=(x, y), log=traverse)
     assert (found.stamp, found.verdict, found.recorded) == (stamp, state, state)
-    turn, out = found.turns[0], tmp_path / "turned.mcap"
-    unit = "rad" if turn.unit == "rad" else turn.unit
-    change = f"navigation_map.{turn.parameter}={turn.needed:.9f} {unit}"
-    assert roverflow("run", traverse, "-p", "fast", *SMALL, "--set", change, "-o", out, "--no-rrd") == 0
+    turn = found.turns[0]
+    change = f"navigation_map.{turn.parameter}={turn.needed:.9f} {turn.unit}"
+    out = run_fast(tmp_path / "turned.mcap", traverse, "--set", change)
     assert verdict_at(out, stamp, x, y) == turn.verdict != state
 
 
@@ -192,11 +191,9 @@ def test_a_cell_without_height_has_no_limits(traverse, fast_result, stamp, said)
 
 
 def test_the_files_of_a_log_in_parts_are_found_beside_the_result_and_taken_by_log(traverse, tmp_path, said):
-    rows, out = mcap_rows(traverse), tmp_path / "result" / "out.mcap"
-    middle = rows[0][3] + 10**9
-    parts = [write_mcap(tmp_path / f"part_{n}.mcap", [r for r in rows if (r[3] > middle) == n]) for n in (0, 1)]
-    out.parent.mkdir()
-    assert roverflow("run", *parts, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
+    (tmp_path / "result").mkdir()
+    parts = halves(traverse, tmp_path)
+    out = run_fast(tmp_path / "result" / "out.mcap", parts)
     words = ("--at", AT, "--cell", "3,0")
     explained = said(0, "why", out, *words, "--log", *parts).out
     shutil.move(out, tmp_path)
@@ -269,8 +266,7 @@ def test_a_stream_that_is_no_navigation_map_is_named_as_such(traverse, tmp_path,
     (("--set", "McapSink.results=[points]"), "contains no /nav/regional_navigation_map, only /nav/diag"),
 ])  # fmt: skip
 def test_a_result_without_the_regional_map_is_refused(traverse, tmp_path, refused, given, why_not):
-    out, part = tmp_path / "out.mcap", ("--end", 0.8, "--no-rrd")
-    assert roverflow("run", traverse, "-p", "fast", *SMALL, *part, *given, "-o", out) == 0
+    out = run_fast(tmp_path / "out.mcap", traverse, "--end", 0.8, *given)
     words = ("--at", 0.6, "--cell", "3,0", "--map", "regional_navigation_map", "--log", traverse)
     assert why_not in refused("why", out, *words)
 
@@ -286,13 +282,12 @@ def test_a_regional_map_without_the_frame_at_the_instant_says_so(traverse, fast_
                 setattr(message.orientation, axis, value)
 
     log = rewrite(traverse, tmp_path / "in.mcap", edit_of("/imu/inclinometer", "sensor_msgs/msg/Imu", tip))
-    assert roverflow("run", log, "-p", "fast", *SMALL, "-o", tmp_path / "out.mcap", "--no-rrd") == 3
+    out = run_fast(tmp_path / "out.mcap", log, code=3)
     words = ("--at", f"{last}", "--cell", "3,0", "--map", "regional_navigation_map")
     until = f"note: the 'regional_navigation_map' from --at on has only frames up to {moment(before)}\n"
-    assert said(0, "why", tmp_path / "out.mcap", *words).out.startswith(until)
+    assert said(0, "why", out, *words).out.startswith(until)
 
 
 def test_transforms_for_viewers_do_not_hide_the_frames_that_saw_a_cell(traverse, tmp_path):
-    given = "-p", "fast", *SMALL, "--set", "McapSink.viewers=true", "--end", 0.8, "--no-rrd"
-    assert roverflow("run", traverse, *given, "-o", tmp_path / "out.mcap") == 0
-    assert len(why_regional(tmp_path / "out.mcap", 60, (3.0, 0.0), log=traverse).frames) == 1
+    out = run_fast(tmp_path / "out.mcap", traverse, "--set", "McapSink.viewers=true", "--end", 0.8)
+    assert len(why_regional(out, 60, (3.0, 0.0), log=traverse).frames) == 1

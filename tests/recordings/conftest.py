@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from tests.conftest import SMALL, roverflow
 from tests.recordings.sample_log import items_of, write_sample
 from tests.recordings.sinks.recorded_scene import START, STEP, Record, record_of, scene
 
@@ -17,6 +18,14 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def whole(sample: Path) -> list[tuple[int, str, Any]]:
     return items_of(sample)
+
+
+@pytest.fixture(scope="session")
+def both(traverse: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of the traverse that also contains its inputs."""
+    out = tmp_path_factory.mktemp("both") / "out.mcap"
+    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
+    return out
 
 
 @pytest.fixture(scope="session")

@@ -10,15 +10,9 @@ from rosbags.rosbag2 import StoragePlugin
 
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_grid_map
-from tests.conftest import SMALL, edit_of, rewrite, roverflow
+from tests.conftest import SMALL, edit_of, rewrite, roverflow, run_fast
 from tests.recordings.containers.forms import rows_of, write_rosbag2
 from tests.recordings.video.encoder import video_log
-
-
-def run(out: Path, *logs: Path) -> Path:
-    """The results of a run."""
-    assert roverflow("run", *logs, "-p", "fast", *SMALL, "-o", out, "--no-rrd") == 0
-    return out
 
 
 def heights_of(log: Path) -> dict[tuple[int, int], float]:
@@ -33,12 +27,12 @@ def heights_of(log: Path) -> dict[tuple[int, int], float]:
 @pytest.mark.parametrize("plugin", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_the_files_of_a_recording_may_be_named_one_by_one(traverse, fast_result, tmp_path, plugin):
     files = sorted(write_rosbag2(rows_of(traverse), tmp_path / "bag", plugin, parts=3).glob("bag_*"))
-    assert rows_of(run(tmp_path / "out.mcap", *files)) == rows_of(fast_result)
+    assert rows_of(run_fast(tmp_path / "out.mcap", files)) == rows_of(fast_result)
 
 
 def test_a_log_in_h264_gives_nearly_the_same_maps(traverse, fast_result, tmp_path):
     video = video_log(traverse, tmp_path / "log.mcap", "h264", "cdr")
-    exact, found = heights_of(fast_result), heights_of(run(tmp_path / "out.mcap", video))
+    exact, found = heights_of(fast_result), heights_of(run_fast(tmp_path / "out.mcap", video))
     check_same(exact, found)
 
 
@@ -51,7 +45,7 @@ def test_a_gray_camera_beside_a_colour_one_gives_nearly_the_same_maps(traverse, 
 
     topic = f"/stereo/{side}/image_rect_color"
     mixed = rewrite(traverse, tmp_path / "log.mcap", edit_of(topic, "sensor_msgs/msg/Image", gray))
-    check_same(heights_of(fast_result), heights_of(run(tmp_path / "out.mcap", mixed)))
+    check_same(heights_of(fast_result), heights_of(run_fast(tmp_path / "out.mcap", mixed)))
     assert roverflow("run", mixed, "-p", "paper", *SMALL, "-o", tmp_path / "paper.mcap") == 0  # with a recording
 
 

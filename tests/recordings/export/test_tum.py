@@ -17,7 +17,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.reporting.page import write_report
 from recordings.ros2 import to_msg as ros2
 from stages.data import ElevationMap, Pose
-from tests.conftest import SMALL, roverflow
+from tests.conftest import roverflow
 
 
 def test_evo_reads_the_poses_of_a_result(result, tmp_path):
@@ -31,11 +31,9 @@ def test_evo_reads_the_poses_of_a_result(result, tmp_path):
     np.testing.assert_allclose(trajectory.orientations_quat_wxyz, turns, atol=1e-6)
 
 
-def test_evo_agrees_with_score_on_the_pose_error(traverse, tmp_path):
-    out = tmp_path / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
-    assert roverflow("score", out, "--json", tmp_path / "score.json") == 0
-    with Reader(out) as log:
+def test_evo_agrees_with_score_on_the_pose_error(both, tmp_path):
+    assert roverflow("score", both, "--json", tmp_path / "score.json") == 0
+    with Reader(both) as log:
         true, given = (read_bag_trajectory(log, topic) for topic in ("/truth/pose", "/nav/pose"))
     true, given = associate_trajectories(true, given)
     # `align_origin` would also turn the first pose's roll and pitch onto the true ones; score turns only its heading.

@@ -16,13 +16,6 @@ def contents(path):
     return found
 
 
-@pytest.fixture(scope="module")
-def both(traverse, tmp_path_factory):
-    out = tmp_path_factory.mktemp("both") / "out.mcap"
-    assert roverflow("run", traverse, *SMALL, "-o", out, "--no-rrd", "--with-inputs") == 0
-    return out
-
-
 def test_a_result_log_contains_the_input_byte_for_byte_beside_the_results(both, traverse, result):
     found, results = contents(both), contents(result)
     for channel, messages in contents(traverse).items():

@@ -4,13 +4,11 @@ import json
 import math
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from flow.cli.main import main
 from recordings.errors import LogError
@@ -29,14 +27,11 @@ from recordings.scoring.table import (
     format_score,
     terrain_lines,
 )  # fmt: skip
-from recordings.simulator import Simulation, ground_truth, write_log
+from recordings.simulator import write_log
 from recordings.simulator.texture import TerrainClass
-from stages.data import Cell, Disparity, ElevationMap, NavigationMap, Transform
-from tests.conftest import chunks_of, edit_of, mcap_rows, rewrite, with_broken, write_mcap
-
-SMALL = Simulation(
-    scene="mixed", frames=2, rate=1.0, width=320, height=240, relief_cells=512, abundance=0.2, color=False, seed=11
-)  # fmt: skip
+from stages.data import ElevationMap
+from tests.conftest import chunks_of, edit_of, halves, rewrite, with_broken
+from tests.recordings.scoring.known_run import BLIND, SMALL, Run, frame_of, truth_of
 
 
 @pytest.fixture(scope="module")
@@ -51,96 +46,21 @@ def frames():
     return [frame_of(index) for index in range(SMALL.frames)]
 
 
-frame_of = cache(SMALL.frame)
+@pytest.fixture
+def scored(tmp_path, truth) -> Callable[..., scoring.Score]:
+    """The score of a run with some changes, against the truth or another log."""
+
+    def score(against: Path = truth, **changes: Any) -> scoring.Score:
+        return scoring.score(Run(**changes).write(tmp_path / "out.mcap"), against)
+
+    return score
 
 
-@cache
-def truth_of(index):
-    """The true disparity and maps of a frame."""
-    stamp, frame = SMALL.stamp(index), frame_of(index)
-    return ground_truth.true_disparity(SMALL, stamp, frame), *ground_truth.truth_maps(SMALL, stamp, frame)
-
-
-@dataclass
-class Run:
-    """A result log made from the truth; each field changes one property."""
-
-    disparity: Callable[[np.ndarray], np.ndarray] = lambda pixels: pixels
-    elevation: Callable[[np.ndarray], np.ndarray] = lambda layer: layer
-    cells: Callable[[np.ndarray], np.ndarray] = lambda cells: cells
-    tilt_error: float = 0.0
-    lower: float = 0.0  # m, by which the origin of the maps is below base_link
-    crop: int = 0
-    resolution: float = 0.05
-    navigation: float | None = None  # its resolution, where it is another
-    skipped: tuple[int, ...] = ()
-    shift: dict[int, int] = field(default_factory=dict)
-    only: tuple[str, ...] = field(default=(*scoring.RESULTS, "/tf"))
-    camera: str = "left_camera_optical"
-    lens: dict[str, float] = field(default_factory=dict)
-    blind: tuple[int, ...] = ()  # frames that say unknown everywhere
-
-    def write(self, path: Path, frames) -> Path:
-        with Ros2Writer(path) as writer:
-            for index, frame in enumerate(frames):
-                if index in self.skipped:
-                    continue
-                stamp = SMALL.stamp(index) + self.shift.get(index, 0)
-                run = replace(self, **BLIND) if index in self.blind else self
-                for topic, message in run.messages(stamp, frame, index).items():
-                    if topic in self.only:
-                        writer.write(topic, message, stamp)
-        return path
-
-    def messages(self, stamp, frame, index):
-        true, terrain, navigation = truth_of(index)
-        disparity = Disparity(
-            stamp, self.disparity(true.pixels.copy()), true.source, true.confidence,
-            camera=replace(SMALL.camera, **self.lens),
-        )  # fmt: skip
-        inside = slice(self.crop, 320 - self.crop), slice(self.crop, 320 - 2 * self.crop)
-        mean = np.where(np.isnan(terrain.layers["mean"]), terrain.layers["elevation"], terrain.layers["mean"])
-        layer = np.ascontiguousarray(self.elevation(mean)[inside])
-        cells = np.ascontiguousarray(self.cells(navigation.cells.copy())[inside])
-        origin = (-8 + self.crop * 0.05, -8 + self.crop * 0.05)
-        level_from_camera = frame.level.inverse().after(frame.base.after(SMALL.mounts[0]))
-        off = Rotation.from_rotvec([0.6 * self.tilt_error, 0.8 * self.tilt_error, 0]).as_matrix()
-        place = level_from_camera.translation + np.array([0.0, 0.0, self.lower])
-        found = Transform("level", self.camera, off @ level_from_camera.rotation, place)
-        picture = Transform("level", "navigation_map/above", np.eye(3), np.zeros(3))  # of a viewer's picture of the map
-        reason = np.zeros(cells.shape, np.uint8)
-        return {
-            "/nav/disparity": ros2.disparity_image(disparity),
-            "/nav/elevation_map": ros2.grid_map(
-                ElevationMap(
-                    stamp, {"elevation": layer, "interpolated": np.ones_like(layer)}, self.resolution, origin, "level"
-                )
-            ),
-            "/nav/navigation_map": ros2.occupancy_grid(
-                NavigationMap(stamp, cells, reason, self.navigation or self.resolution, origin, "level")
-            ),
-            "/tf": ros2.transform_message([(found, stamp), (picture, stamp)]),
-        }
-
-
-BLIND = {
-    "disparity": lambda pixels: np.full_like(pixels, np.nan),
-    "elevation": lambda layer: np.full_like(layer, np.nan),
-    "cells": lambda cells: np.full_like(cells, Cell.UNKNOWN),
-}
-
-
-def scored(tmp_path, truth, frames, **changes) -> scoring.Score:
-    return scoring.score(Run(**changes).write(tmp_path / "out.mcap", frames), truth)
-
-
-def test_disparity_is_also_scored_by_the_class_of_the_surface(tmp_path, truth, frames):
+def test_disparity_is_also_scored_by_the_class_of_the_surface(scored, frames):
     codes = {kind.name.lower(): int(kind) for kind in TerrainClass if kind != TerrainClass.SKY}
     assert codes == SURFACES
     off = frames[0].terrain_class == TerrainClass.ROCK
-    found = scored(
-        tmp_path, truth, frames[:1], disparity=lambda pixels: pixels + np.float32(3) * off, skipped=(1,)
-    ).disparity
+    found = scored(disparity=lambda pixels: pixels + np.float32(3) * off, skipped=(1,)).disparity
     both = frames[0].seen == 255
     for name, code in codes.items():
         pixels = int(np.count_nonzero(both & (frames[0].terrain_class == code)))
@@ -151,8 +71,8 @@ def test_disparity_is_also_scored_by_the_class_of_the_surface(tmp_path, truth, f
         assert math.isnan(bad) if pixels + hidden == 0 else bad == pytest.approx(expected)
 
 
-def test_the_truth_itself_scores_perfectly(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames)
+def test_the_truth_itself_scores_perfectly(scored, frames):
+    found = scored()
     assert (found.frames, found.compared, found.missing, found.unmatched) == (2, 2, {}, {})
     assert found.disparity["pixels"] == sum((frame.seen == 255).sum() for frame in frames)
     assert found.disparity["bad_0.5"] == found.disparity["rmse"] == 0
@@ -190,8 +110,8 @@ WIDE = r"its cells are 0\.1 m wide, the truth's 0\.05 m; run with that resolutio
     ({"lower": 0.1}, dict.fromkeys(("elevation_map", "navigation_map"),
      r"its origin is 1\.\d\d m from the camera, the truth's \(base_link\) \d\.\d\d m")),
 ])  # fmt: skip
-def test_what_does_not_fit_the_truth_is_not_scored_but_all_else_is(tmp_path, truth, frames, changed, reasons):
-    found = scored(tmp_path, truth, frames, **changed)
+def test_what_does_not_fit_the_truth_is_not_scored_but_all_else_is(scored, tmp_path, truth, changed, reasons):
+    found = scored(**changed)
     assert found.unscored.keys() == {f"/nav/{name}" for name in reasons}
     for name, reason in reasons.items():
         ((why, count),) = found.unscored[f"/nav/{name}"].items()
@@ -204,24 +124,24 @@ def test_what_does_not_fit_the_truth_is_not_scored_but_all_else_is(tmp_path, tru
     assert main(["score", str(tmp_path / "out.mcap"), "--truth", str(truth)]) == 3
 
 
-def test_a_result_with_no_comparable_message_is_not_scored(tmp_path, truth, frames):
+def test_a_result_with_no_comparable_message_is_not_scored(scored):
     only = ("/nav/elevation_map", "/nav/navigation_map")
     with pytest.raises(LogError, match=r"no result fits the truth in .*: /nav/elevation_map: its cells"):
-        scored(tmp_path, truth, frames, only=only, resolution=0.1)
-    assert scored(tmp_path, truth, frames, resolution=0.1, skipped=(1,)).terrain is None
+        scored(only=only, resolution=0.1)
+    assert scored(resolution=0.1, skipped=(1,)).terrain is None
 
 
-def test_simulated_frames_are_cropped_by_their_largest_disparity(tmp_path, truth, frames):
+def test_simulated_frames_are_cropped_by_their_largest_disparity(scored, frames):
     largest = [np.nanmax(truth_of(index)[0].pixels) for index in range(SMALL.frames)]
     widths = [math.ceil(disparity / 16) * 16 for disparity in largest]
-    found = scored(tmp_path, truth, frames).disparity["cropped_image"]
+    found = scored().disparity["cropped_image"]
     assert found["leftmost_columns_cropped"] == sorted(set(widths))
     kept = [(frame.seen == 255)[:, width:].sum() for frame, width in zip(frames, widths, strict=True)]
     assert found["nonocc"]["pixels"] == sum(kept)
 
 
-def test_a_smaller_map_is_compared_by_place_and_loses_completeness(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, crop=40).terrain
+def test_a_smaller_map_is_compared_by_place_and_loses_completeness(scored):
+    found = scored(crop=40).terrain
     assert found["heights"]["0-8 m"]["raw"]["rmse"] == 0
     assert found["heights"]["0-4 m"]["completeness"] == 1
     assert 0.05 < found["heights"]["4-8 m"]["completeness"] < 0.9
@@ -229,8 +149,8 @@ def test_a_smaller_map_is_compared_by_place_and_loses_completeness(tmp_path, tru
     assert 0.05 < found["hazards"]["unknown"] < 0.9
 
 
-def test_the_shares_of_a_blind_map_are_in_its_row_of_a_table(tmp_path, truth, frames):
-    nothing = scored(tmp_path, truth, frames, cells=BLIND["cells"])
+def test_the_shares_of_a_blind_map_are_in_its_row_of_a_table(scored):
+    nothing = scored(cells=BLIND["cells"])
     row = dict(zip(SCORES, brief_row("blind", brief_figures(nothing)), strict=True))
     assert (row["missed"], row["false alarm"], row["unknown"]) == ("0.00 %", "0.00 %", "100.00 %")
 
@@ -247,12 +167,12 @@ def test_the_columns_of_several_rows_have_their_units():
     assert brief_columns([]) == {}
 
 
-def test_a_missing_frame_scores_as_one_of_unknown_cells(tmp_path, truth, frames):
-    alone = scored(tmp_path, truth, frames, only=("/nav/disparity",))
+def test_a_missing_frame_scores_as_one_of_unknown_cells(scored, frames):
+    alone = scored(only=("/nav/disparity",))
     assert alone.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
     assert alone.terrain["hazards"]["unknown"] == alone.disparity["density"] == 1
-    silent = scored(tmp_path, truth, frames, skipped=(1,))
-    honest = scored(tmp_path, truth, frames, blind=(1,))
+    silent = scored(skipped=(1,))
+    honest = scored(blind=(1,))
     assert silent.disparity == honest.disparity
     assert terrain_lines(silent.terrain) == terrain_lines(honest.terrain)
     known, seen = np.sum(frames[0].seen == 255), sum(np.sum(frame.seen == 255) for frame in frames)
@@ -267,52 +187,52 @@ def test_a_missing_frame_scores_as_one_of_unknown_cells(tmp_path, truth, frames)
     assert honest.missing == {}
 
 
-def test_a_result_that_no_frame_has_is_missing_with_the_remedy(tmp_path, truth, frames):
-    text = format_score(scored(tmp_path, truth, frames, only=scoring.RESULTS[1:]))
+def test_a_result_that_no_frame_has_is_missing_with_the_remedy(scored, tmp_path, truth):
+    text = format_score(scored(only=scoring.RESULTS[1:]))
     assert "/nav/disparity: 2 of 2 frames, scored as all unknown; name the stream 'disparity', and" in text
-    partly = Run(skipped=(1,)).write(tmp_path / "partly.mcap", frames)
+    partly = Run(skipped=(1,)).write(tmp_path / "partly.mcap")
     assert "1 of 2 frames, scored as all unknown\n" in format_score(scoring.score(partly, truth))
 
 
-def test_an_unscored_tilt_has_a_reason(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, only=scoring.RESULTS)
+def test_an_unscored_tilt_has_a_reason(scored):
+    found = scored(only=scoring.RESULTS)
     assert found.tilt is None
     assert found.untilted == {"the result has no /tf from 'level' at that stamp": 2}
     assert "not scored in 2 frames: the result has no /tf from 'level'" in format_score(found)
-    other = scored(tmp_path, truth, frames, camera="mast_camera")
+    other = scored(camera="mast_camera")
     assert other.untilted == {"the truth has no mount of 'mast_camera' on 'left_camera_optical'": 2}
-    partly = scored(tmp_path, truth, frames, skipped=(0,))
+    partly = scored(skipped=(0,))
     assert (partly.tilt["frames"], sum(partly.untilted.values())) == (1, 1)
 
 
-def test_the_tilt_error_is_the_angle_between_the_two_ups(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, tilt_error=0.01)
+def test_the_tilt_error_is_the_angle_between_the_two_ups(scored):
+    found = scored(tilt_error=0.01)
     assert (found.tilt["mean"], found.tilt["max"]) == pytest.approx((0.01, 0.01), abs=1e-6)
 
 
-def test_results_at_stamps_without_truth_are_reported_not_scored(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, shift={1: 1})
+def test_results_at_stamps_without_truth_are_reported_not_scored(scored):
+    found = scored(shift={1: 1})
     assert (found.frames, found.compared) == (2, 1)
     assert found.unmatched == dict.fromkeys(scoring.RESULTS, 1)
     assert "/nav/disparity: 1 message at stamps without truth" in format_score(found)
     with pytest.raises(LogError, match=r"no result in .* has a stamp of"):
-        scored(tmp_path, truth, frames, shift={0: 1, 1: 1})
+        scored(shift={0: 1, 1: 1})
 
 
 @pytest.mark.parametrize(("topics", "ahead"), [("", -(10**18)), ("", 3_600_000_000_000), ("/truth/rocks", 3 * 10**9)])
-def test_log_times_do_not_change_the_score(tmp_path, truth, frames, topics, ahead):
+def test_log_times_do_not_change_the_score(scored, tmp_path, truth, topics, ahead):
     path = tmp_path / "other.mcap"
     other = rewrite(truth, path, time=lambda topic, time: time + ahead * topic.startswith(topics))
-    assert scored(tmp_path, other, frames).to_json() == scored(tmp_path, truth, frames).to_json()
+    assert scored(other).to_json() == scored().to_json()
 
 
 @pytest.mark.parametrize("off", [3 * 3600, -3 * 3600])
-def test_a_wrong_stamp_in_the_truth_does_not_part_the_logs(tmp_path, truth, frames, off):
+def test_a_wrong_stamp_in_the_truth_does_not_part_the_logs(scored, tmp_path, truth, frames, off):
     def wrong(index, message):
         message.header.stamp.sec += off * (index == 0)
 
     edit = edit_of("/truth/pose", "nav_msgs/msg/Odometry", wrong)
-    found = scored(tmp_path, rewrite(truth, tmp_path / "other.mcap", edit), frames)
+    found = scored(rewrite(truth, tmp_path / "other.mcap", edit))
     assert (found.frames, found.compared, found.missing, found.unmatched) == (3, 2, {}, {})
 
 
@@ -321,22 +241,22 @@ def without(truth, path, *topics):
     return rewrite(truth, path, lambda topic, index, data: None if topic in topics else data, silent=True)
 
 
-def test_a_truth_topic_without_messages_is_ignored(tmp_path, truth, frames):
-    found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/occlusion", "/truth/rocks"), frames)
+def test_a_truth_topic_without_messages_is_ignored(scored, tmp_path, truth):
+    found = scored(without(truth, tmp_path / "bare.mcap", "/truth/occlusion", "/truth/rocks"))
     assert found.disparity["whole_image"]["all"]["bad_0.5"] == 0
     assert found.terrain["heights"]["0-8 m"]["raw"]["rmse"] < 1e-6
     assert found.unscored == {}
 
 
-def test_an_incomplete_truth_names_the_missing_topic(tmp_path, truth, frames):
-    found = scored(tmp_path, without(truth, tmp_path / "bare.mcap", "/truth/navigation_map"), frames)
+def test_an_incomplete_truth_names_the_missing_topic(scored, tmp_path, truth):
+    found = scored(without(truth, tmp_path / "bare.mcap", "/truth/navigation_map"))
     assert found.terrain is None
     line = "not scored   /truth/elevation_map: 2 frames: the truth has no /truth/navigation_map there"
     assert line in format_score(found).splitlines()
 
 
-def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, truth, frames):
-    run = Run().write(tmp_path / "run.mcap", frames)
+def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, truth):
+    run = Run().write(tmp_path / "run.mcap")
     with pytest.raises(LogError, match="no ground truth"):
         scoring.score(run, run)
     with pytest.raises(LogError, match="is not a result log: it has no /nav topics"):
@@ -348,13 +268,13 @@ def test_logs_that_cannot_be_compared_are_refused_with_the_reason(tmp_path, trut
         scoring.score(tmp_path / "other.mcap", truth)
 
 
-def test_padded_rows_of_a_mask_do_not_change_the_score(tmp_path, truth, frames):
+def test_padded_rows_of_a_mask_do_not_change_the_score(scored, tmp_path, truth):
     def pad(_, image):
         rows = np.pad(np.asarray(image.data).reshape(image.height, -1), ((0, 0), (0, 3)))
         image.data, image.step = rows.ravel(), rows.shape[1]
 
     other = rewrite(truth, tmp_path / "other.mcap", edit_of("truth/occlusion", "sensor_msgs/msg/Image", pad))
-    assert scored(tmp_path, other, frames).disparity == scored(tmp_path, truth, frames).disparity
+    assert scored(other).disparity == scored().disparity
 
 
 @pytest.mark.parametrize(("topic", "schema", "edit", "why"), [
@@ -363,19 +283,17 @@ def test_padded_rows_of_a_mask_do_not_change_the_score(tmp_path, truth, frames):
     ("/navigation_map", "nav_msgs/msg/OccupancyGrid", lambda _, grid: setattr(grid.header, "frame_id", "x"), "it is "),
     ("/elevation_map", "grid_map_msgs/msg/GridMap", lambda _, grid: grid.layers.__setitem__(2, "x"), "the truth lacks"),
 ])  # fmt: skip
-def test_a_truth_that_cannot_be_scored_is_named_with_the_reason(tmp_path, truth, frames, topic, schema, edit, why):
+def test_a_truth_that_cannot_be_scored_is_named_with_the_reason(scored, tmp_path, truth, topic, schema, edit, why):
     other = rewrite(truth, tmp_path / "other.mcap", edit_of(f"truth{topic}", schema, edit))
     place = rf"out.mcap or .*other.mcap has a message at {SMALL.stamp(0)} ns that cannot be scored: {why}.*; record"
     with pytest.raises(LogError, match=place):
-        scored(tmp_path, other, frames)
+        scored(other)
 
 
 def test_a_truth_in_several_files_is_that_of_one(tmp_path, truth, frames):
-    run, folder = Run(blind=(1,)).write(tmp_path / "run.mcap", frames), tmp_path / "bag"
+    run, folder = Run(blind=(1,)).write(tmp_path / "run.mcap"), tmp_path / "bag"
     folder.mkdir()
-    rows = mcap_rows(truth)
-    halves = rows[: len(rows) // 2], rows[len(rows) // 2 :]
-    files = [write_mcap(folder / f"bag_{number}.mcap", half) for number, half in enumerate(halves)]
+    files = halves(truth, folder)
     whole = scoring.score(run, truth)
     assert whole.frames == 2
     assert scoring.score(run, files).to_json() == scoring.score(run, folder).to_json() == whole.to_json()
@@ -389,8 +307,8 @@ def test_a_log_has_its_name_also_in_its_own_folder(tmp_path, monkeypatch):
     assert names_of([Path(".."), tmp_path / "link.mcap"]) == "bag, link.mcap"
 
 
-def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth, frames):
-    run = Run().write(tmp_path / "run.mcap", frames)
+def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth):
+    run = Run().write(tmp_path / "run.mcap")
     for topic in ("/truth/disparity", "/truth/rocks"):
         chunk, topics = next(each for each in chunks_of(truth) if topic in each[1])
         damaged = with_broken(truth, chunk)
@@ -413,8 +331,8 @@ def test_frames_lost_in_a_damaged_truth_are_not_scored(tmp_path, truth, frames):
     assert main(["score", str(run), "--truth", str(truth)]) == 0
 
 
-def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
-    found = scored(tmp_path, truth, frames, skipped=(1,), elevation=lambda layer: layer + np.float32(0.02))
+def test_a_score_prints_as_a_table_and_as_json(scored):
+    found = scored(skipped=(1,), elevation=lambda layer: layer + np.float32(0.02))
     table = format_score(found)
     assert "1 of 2 have results" in table
     assert "/nav/disparity: 1 of 2 frames, scored as all unknown" in table
@@ -432,7 +350,7 @@ def test_a_score_prints_as_a_table_and_as_json(tmp_path, truth, frames):
     read = json.loads(found.to_json())
     assert read["terrain"]["heights"]["0-4 m"]["raw"]["bias"] == pytest.approx(0.02, abs=1e-6)
     assert read["per_frame"][0]["stamp"] == SMALL.stamp(0)
-    empty = scored(tmp_path, truth, frames, elevation=lambda layer: np.full_like(layer, np.nan))
+    empty = scored(elevation=lambda layer: np.full_like(layer, np.nan))
     assert json.loads(empty.to_json())["terrain"]["heights"]["0-4 m"]["raw"]["rmse"] is None
     assert "nan" not in format_score(empty) + format_brief(empty)
     assert " 0.00% |      -      -      -      -            -" in format_score(empty)
