@@ -13,14 +13,14 @@ from flow.cli.debugging.viewer_cursor import without_cursor
 from flow.errors import UsageError
 from recordings import McapSource
 from tests.conftest import SMALL, mcap_rows, roverflow, write_mcap
-from tests.recordings.sample_log import LEFT, changed, write_sample
+from tests.recordings.sample_log import LEFT, changed, stamps_in, write_sample
 from tests.viewers import viewer
 
 
 @pytest.fixture(scope="module")
 def stamps(traverse):
     with McapSource().open(traverse) as log:
-        return [item.stamp for _, stream, item in log.events(("left",)) if stream == "left"]
+        return stamps_in(log.events(("left",)))
 
 
 @pytest.mark.parametrize("shown", [
@@ -33,7 +33,7 @@ def test_a_time_as_the_viewer_shows_it_is_that_of_the_frame(traverse, stamps, sh
         for stamp in stamps:
             part = part_of(log, instant(shown(stamp)), 1, 0)
             with McapSource().open(traverse, start=part.start, end=part.end) as cut:
-                assert [item.stamp for _, stream, item in cut.events(("left",)) if stream == "left"] == [stamp]
+                assert stamps_in(cut.events(("left",))) == [stamp]
 
 
 @pytest.mark.parametrize("joined", [False, True])
@@ -52,8 +52,7 @@ def test_the_frame_of_a_stamp_is_read_however_late_the_log_has_it(traverse, stam
         for number, stamp in enumerate(stamps):
             part = part_of(opened, np.datetime64(stamp, "ns"), 1, min(number, 1))
             opened.narrow(part.start, part.end)
-            read = [item.stamp for _, stream, item in opened.events(("left",)) if stream == "left"]
-            assert read == stamps[max(number - 1, 0) : number + 1]
+            assert stamps_in(opened.events(("left",))) == stamps[max(number - 1, 0) : number + 1]
 
 
 def test_a_time_of_day_is_that_of_stamps_also_where_they_are_of_another_clock(tmp_path):

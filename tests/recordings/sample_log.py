@@ -163,6 +163,11 @@ def refused_in(path: Path, **settings: Any) -> dict[str, str]:
         return log.refused
 
 
+def stamps_in(events: Iterable[Event], stream: str = "left") -> list[int]:
+    """The stamps of the sound items of a stream among events."""
+    return [item.stamp for _, name, item in events if name == stream and not isinstance(item, Exception)]
+
+
 def losses_in(events: Iterable[Event]) -> list[tuple[int, str, str]]:
     """The losses among events, with their sentences."""
     return [(time, stream, str(item)) for time, stream, item in events if isinstance(item, Exception)]

@@ -32,7 +32,7 @@ from recordings.source.topics import MAX_CHANNELS
 from stages.data import Tilt
 from tests.conftest import write_mcap
 from tests.recordings.encodings.rewritten import ROS1, WRITERS, as_ros1, json_log
-from tests.recordings.sample_log import FRAMES, essences, items_of, model
+from tests.recordings.sample_log import FRAMES, essences, items_of, model, stamps_in
 
 NOTHING = f"c/E[{{}}] x\n{'=' * 80}\nMSG: c/E\n"
 
@@ -44,11 +44,10 @@ def test_the_same_items_are_read_from_every_encoding(sample, whole, tmp_path, na
 
 
 def test_a_part_of_a_log_begins_at_the_same_frame_in_every_encoding(sample, tmp_path):
-    stamps = []
-    for log in (sample, *(write(sample, tmp_path / name) for name, write in WRITERS.items())):
-        stamps.append([item.stamp for _, stream, item in items_of(log, start=0.15) if stream == "left"])
-    assert len(stamps[0]) == 3
-    assert all(others == stamps[0] for others in stamps)
+    expected = stamps_in(items_of(sample, start=0.15))
+    assert len(expected) == 3
+    for name, write in WRITERS.items():
+        assert stamps_in(items_of(write(sample, tmp_path / name), start=0.15)) == expected, name
 
 
 def test_an_image_in_json_is_decoded_once_also_in_a_part_of_a_log(sample, tmp_path, monkeypatch):

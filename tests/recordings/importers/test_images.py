@@ -19,7 +19,7 @@ from stages.rectification.rectify import Rectify
 from stages.rectification.row_offset import measure
 from tests.conftest import data_folder, roverflow
 from tests.recordings.importers.simulated import EXACT, assert_same, own_log, seen_in, write_images
-from tests.recordings.sample_log import frame_of, picture
+from tests.recordings.sample_log import frame_of, picture, stamps_in
 
 CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
 
@@ -58,7 +58,7 @@ def test_images_are_logged_bit_for_bit_at_the_rate(tmp_path):
         assert (frame.camera.baseline, frame.camera.raw) == (pytest.approx(0.25), None)
     stamps = [item.stamp for item in images["left"]]
     assert np.diff(stamps).tolist() == [250_000_000] * 2
-    tilts = [item.stamp for _, stream, item in read if stream == "inclinometer"]
+    tilts = stamps_in(read, "inclinometer")
     for stamp in stamps:
         assert stamp in tilts
         assert min(tilts) < stamp < max(tilts)
@@ -238,8 +238,7 @@ def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, said)
     text = said(0, "import", "images", tmp_path / "pairs", tmp_path / "out.mcap", *given).out
     assert f"2 pairs left out, first: {right[1]} is truncated after" in text
     assert "2 stereo frames" in text
-    read = [item.stamp for _, stream, item in events(tmp_path / "out.mcap") if stream == "left"]
-    assert np.diff(read).tolist() == [3_000_000_000]
+    assert np.diff(stamps_in(events(tmp_path / "out.mcap"))).tolist() == [3_000_000_000]
 
 
 def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):

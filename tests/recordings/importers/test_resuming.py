@@ -1,6 +1,7 @@
 """An interrupted import is continued by the same command, and gives the bytes of one that was not interrupted."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +16,7 @@ from recordings.importers import recording
 from recordings.importers.files import read_bytes
 from recordings.mcap.file import McapFile
 from recordings.mcap.resumable import ResumableWriter
-from tests.conftest import roverflow, slow
+from tests.conftest import patch, roverflow, slow
 from tests.limits import file_size_limited
 from tests.recordings.sample_log import model
 
@@ -61,6 +62,21 @@ def importing(source, out, pitch_down=15):
     return "import", "images", source / "pairs", out, *given
 
 
+def ended(source, out, last, number):
+    """The output of an import whose process gets a signal at its `last` image."""
+    command = [sys.executable, "-c", CHILD, str(last), str(int(number)), *map(str, importing(source, out))]
+    child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert child.returncode == (-number if number == signal.SIGKILL else 130), child.stderr
+    return child.stdout
+
+
+def check_whole(source, out):
+    """The import leaves the log of an uninterrupted one, and no other file."""
+    assert roverflow(*importing(source, out)) == 0
+    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    assert [path.name for path in out.parent.iterdir()] == ["out.mcap"]
+
+
 @pytest.fixture
 def logged(monkeypatch):
     """The names of the image files that are read for the log."""
@@ -89,29 +105,26 @@ def interrupted(source, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, *slow(signal.SIGINT)])
-def test_the_import_of_a_process_that_was_ended_is_continued(source, tmp_path, number, said, logged):
+def test_the_import_of_a_process_that_was_ended_is_continued(source, tmp_path, number, capsys, logged):
     out = tmp_path / "out.mcap"
-    command = [sys.executable, "-c", CHILD, "8", str(int(number)), *map(str, importing(source, out))]
-    child = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert child.returncode == (-number if number == signal.SIGKILL else 130), child.stderr
+    printed = ended(source, out, 8, number)
     if number != signal.SIGKILL:
-        assert f"{out}: not complete; run the same command again to continue the import" in child.stdout
+        assert f"{out}: not complete; run the same command again to continue the import" in printed
     (left,) = tmp_path.iterdir()
     assert left.suffix == ".partial"
-    assert f"{out}: continues the interrupted import after 3 frames" in said(0, *importing(source, out)).out
-    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
-    assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
+    check_whole(source, out)
+    assert f"{out}: continues the interrupted import after 3 frames" in capsys.readouterr().out
     assert {name[0] for name in logged} == {"3", "4", "5"}  # the others are not read again
 
 
-def test_the_import_that_a_full_disk_ended_is_continued(source, tmp_path, capsys, said):
-    out, whole = tmp_path / "out.mcap", (source / "whole.mcap").read_bytes()
-    with file_size_limited(len(whole) // 2):
+def test_the_import_that_a_full_disk_ended_is_continued(source, tmp_path, capsys):
+    out = tmp_path / "out.mcap"
+    with file_size_limited((source / "whole.mcap").stat().st_size // 2):
         assert roverflow(*importing(source, out)) == 1
     (left,) = tmp_path.iterdir()
     assert f"what was written is in {left}, and the same command continues it" in capsys.readouterr().err
-    assert "continues the interrupted import after" in said(0, *importing(source, out)).out
-    assert out.read_bytes() == whole
+    check_whole(source, out)
+    assert "continues the interrupted import after" in capsys.readouterr().out
 
 
 def test_wherever_the_log_was_cut_or_damaged_the_result_is_the_same(source, interrupted):
@@ -121,8 +134,7 @@ def test_wherever_the_log_was_cut_or_damaged_the_result_is_the_same(source, inte
         zeros = bytes(min(4096, len(whole) - place))  # a block that never reached the disk
         for content in (whole[:place], whole[:place] + zeros + whole[place + len(zeros) :]):
             interrupted.write_bytes(content)
-            assert roverflow(*importing(source, out)) == 0
-            assert out.read_bytes() == whole, place
+            check_whole(source, out)
 
 
 def test_a_chunk_of_wrong_length_costs_only_its_own_images(source, interrupted, logged):
@@ -130,34 +142,26 @@ def test_a_chunk_of_wrong_length_costs_only_its_own_images(source, interrupted, 
         (right,) = (number for number, channel in log.channels.items() if channel.topic.startswith("/stereo/right/im"))
         second = np.flatnonzero(log.timeline.channels == right)[1]
         (chunk,) = (chunk for chunk in log.index.chunks if second in chunk.places)
-    content, out = bytearray(interrupted.read_bytes()), interrupted.with_name("out.mcap")
-    content[chunk.offset + 7] ^= 1  # of the length, which is now beyond the end of the log
-    interrupted.write_bytes(content)
-    assert roverflow(*importing(source, out)) == 0
-    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    patch(interrupted, chunk.offset + 7, b"\1")  # of the length, which is now beyond the end of the log
+    check_whole(source, interrupted.with_name("out.mcap"))
     assert [name for name in logged if name[0] in "012"] == ["1-right.png"]
 
 
-def test_an_import_that_is_killed_again_loses_nothing_of_the_first_one(source, tmp_path, said, logged):
+def test_an_import_that_is_killed_again_loses_nothing_of_the_first_one(source, tmp_path, capsys, logged):
     out = tmp_path / "out.mcap"
     ends = (1, signal.SIGTERM), (8, signal.SIGKILL), (1, signal.SIGTERM), (4, signal.SIGTERM), (1, signal.SIGKILL)
     for count, (last, number) in enumerate(ends):  # the images read before it: none, 3 pairs, none, 1 more, none
-        command = [sys.executable, "-c", CHILD, str(last), str(int(number)), *map(str, importing(source, out))]
-        ended = subprocess.run(command, cwd=ROOT, capture_output=True, check=False)
-        assert ended.returncode == (-number if number == signal.SIGKILL else 130)
+        ended(source, out, last, number)
         assert any(tmp_path.iterdir()) == (count > 0)  # a log of nothing is not kept
-    assert f"{out}: continues the interrupted import after 4 frames" in said(0, *importing(source, out)).out
-    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
-    assert [path.name for path in tmp_path.iterdir()] == ["out.mcap"]
+    check_whole(source, out)
+    assert f"{out}: continues the interrupted import after 4 frames" in capsys.readouterr().out
     assert {name[0] for name in logged} == {"4", "5"}
 
 
 def test_the_smaller_log_that_a_kill_during_copying_left_is_replaced(source, interrupted):
-    out, content = interrupted.with_name("out.mcap"), interrupted.read_bytes()
-    interrupted.with_suffix(".before").write_bytes(content)
-    interrupted.write_bytes(content[: len(content) // 2])
-    assert roverflow(*importing(source, out)) == 0
-    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    shutil.copy(interrupted, interrupted.with_suffix(".before"))
+    os.truncate(interrupted, interrupted.stat().st_size // 2)
+    check_whole(source, interrupted.with_name("out.mcap"))
 
 
 def test_only_the_images_of_an_import_with_other_options_are_copied(source, interrupted, logged):
@@ -184,23 +188,21 @@ def test_an_import_for_another_size_of_images_is_not_continued(source):
 
 
 def test_an_import_of_an_image_that_changed_is_not_continued(source, interrupted, capsys):
-    out, image = interrupted.with_name("out.mcap"), source / "pairs" / "0-left.png"
-    state, whole = image.stat(), (source / "whole.mcap").read_bytes()
+    image = source / "pairs" / "0-left.png"
+    state = image.stat()
     try:
         os.utime(image, ns=(state.st_atime_ns, state.st_mtime_ns + 1))
-        assert roverflow(*importing(source, out)) == 0
+        check_whole(source, interrupted.with_name("out.mcap"))
     finally:
         os.utime(image, ns=(state.st_atime_ns, state.st_mtime_ns))
     assert "is not continued" in capsys.readouterr().out
-    assert out.read_bytes() == whole
-    assert [path.name for path in out.parent.iterdir()] == ["out.mcap"]
 
 
-def test_two_imports_of_one_log_do_not_mix(source, interrupted, said):
+def test_two_imports_of_one_log_do_not_mix(source, interrupted, said, capsys):
     out = interrupted.with_name("out.mcap")
     mark = interrupted.name.removeprefix("out.mcap.import-").removesuffix(".partial")
     with ResumableWriter(out, mark) as other:
         assert "is being written by another import" in said(1, *importing(source, out)).err
         other.abort()
-    assert "continues the interrupted import after 3 frames" in said(0, *importing(source, out)).out
-    assert out.read_bytes() == (source / "whole.mcap").read_bytes()
+    check_whole(source, out)
+    assert "continues the interrupted import after 3 frames" in capsys.readouterr().out

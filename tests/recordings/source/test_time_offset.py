@@ -15,13 +15,13 @@ from tests.recordings.sample_log import (
     TILT,
     UNSTAMPED,
     Edit,
-    Event,
     changed,
     dropped,
     essences,
     inventory_of,
     items_of,
     losses_in,
+    stamps_in,
     tilt_quaternion,
     write_sample,
 )  # fmt: skip
@@ -52,8 +52,8 @@ def test_a_group_of_settings_of_another_type_is_refused(name, value):
 def test_messages_without_a_stamp_are_moved_from_their_log_times(sample, tmp_path):
     path = write_sample(tmp_path / "log.mcap", changed(TILT, UNSTAMPED))
     assert essences(items_of(path)) == essences(items_of(sample))
-    stamps = stamps_of(items_of(path, McapSource(time_offset=TimeOffsets(inclinometer=LATE))))
-    assert stamps == [stamp + LATE for stamp in stamps_of(items_of(sample))]
+    moved = items_of(path, McapSource(time_offset=TimeOffsets(inclinometer=LATE)))
+    assert stamps_in(moved, "inclinometer") == [stamp + LATE for stamp in stamps_in(items_of(sample), "inclinometer")]
 
 
 def test_a_lost_message_stays_a_loss(tmp_path):
@@ -65,9 +65,8 @@ def test_a_lost_message_stays_a_loss(tmp_path):
 def test_a_range_has_both_images_of_a_frame_by_corrected_stamps(tmp_path):
     late = write_sample(tmp_path / "late.mcap", later(RIGHT, PERIOD))
     events = items_of(late, McapSource(time_offset=TimeOffsets(right=-PERIOD)), start=0.1, end=0.3)
-    left, right = ([item.stamp for _, stream, item in events if stream == side] for side in ("left", "right"))
-    assert left == right
-    assert len(left) == 2
+    assert stamps_in(events, "left") == stamps_in(events, "right")
+    assert len(stamps_in(events)) == 2
 
 
 @pytest.mark.parametrize("logged_late", [0, 2_000_000_000])
@@ -80,7 +79,7 @@ def test_a_range_has_the_tilts_around_it_by_corrected_stamps(tmp_path, logged_la
     source = McapSource(time_offset=TimeOffsets(inclinometer=-late))
     start = 5.1 - logged_late / 1e9
     events = items_of([images, tilts], source, start=start, end=start + 0.2)
-    inside = {stamp - START for stamp in stamps_of(events)}
+    inside = {stamp - START for stamp in stamps_in(events, "inclinometer")}
     assert inside == {*range(-900_000_000, 1_300_000_000, PERIOD)}
 
 
@@ -104,7 +103,3 @@ def test_info_names_the_offset_of_another_clock(tmp_path, seconds):
         with McapSource(time_offset=TimeOffsets(inclinometer=given * 1_000_000_000)).open(path) as log:
             text = format_description(describe(log, max_gap_of=lambda intervals: 2 * PERIOD))
         assert (setting in text) == (given != -seconds)
-
-
-def stamps_of(events: list[Event]) -> list[int]:
-    return [item.stamp for _, stream, item in events if stream == "inclinometer"]

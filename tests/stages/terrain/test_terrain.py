@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from stages import Binarise, Clean, Fuse, Level, Reproject, TerrainFeatures, Voxelise
-from stages.data import Array, Cell, ElevationMap, NavigationMap, Pose, Rover, StereoCamera, StereoFrame, Tilt
+from stages.data import Array, Cell, ElevationMap, NavigationMap, Pose, Rover, Tilt
+from tests.bench.stereo_scores import devon
 from tests.conftest import data_folder
 from tests.stages.running import Running
 from tests.stages.terrain.region_scene import centres
@@ -123,19 +124,17 @@ def test_the_edge_of_a_drop_is_not_free_in_the_regional_map():
 
 
 def test_the_boulder_of_a_real_scene_stands_on_level_ground():
-    folder = data_folder("devon")
-    left, right = (cv2.imread(str(folder / f"devon2-{side}.png"))[..., ::-1] for side in ("left", "right"))
+    given = dict(devon(data_folder("devon").parent))["devon2"]
     # The left image of a point lies 0.6 px lower than its right image in this data set.
-    right = cv2.warpAffine(right, np.array([[1, 0, 0], [0, 1, 0.6]], np.float32), (1280, 960))
+    right = cv2.warpAffine(given.right, np.array([[1, 0, 0], [0, 1, 0.6]], np.float32), (1280, 960))
+    frame = replace(given, right=right)
     matcher = cv2.StereoSGBM.create(0, 192, 5, 200, 800, 1, 0, 10, 100, 2, cv2.STEREO_SGBM_MODE_SGBM_3WAY)
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
+    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.left, frame.right)]
     pixels = matcher.compute(*gray).astype(np.float32) / 16
     pixels[pixels <= 0] = np.nan
-    camera = StereoCamera(968.999694824, 968.999694824, 635.139038086, 463.537109375, 0.239977002, 1280, 960)
     pitch = np.deg2rad(14.2)
-    up = np.array([0, -np.cos(pitch), -np.sin(pitch)])
-    frame, tilt = StereoFrame(7, left, right, camera), Tilt(7, up, camera.frame_id)
-    elevation = mapped(frame, as_disparity(pixels, camera), tilt, camera_height=0.886)
+    tilt = Tilt(frame.stamp, np.array([0, -np.cos(pitch), -np.sin(pitch)]), frame.camera.frame_id)
+    elevation = mapped(frame, as_disparity(pixels, frame.camera, frame.stamp), tilt, camera_height=0.886)
     height, navigation = elevation.layers["elevation"], Binarise()(elevation)
     middle, per_metre = elevation.shape[0] // 2, round(1 / elevation.resolution)
     path = np.s_[middle - per_metre : middle + per_metre // 2, middle + 2 * per_metre : middle + 4 * per_metre]
