@@ -41,21 +41,6 @@ def test_a_middlebury_scene_is_imported_run_and_scored(tmp_path, said):
     assert refined["density"] > matched["density"]
 
 
-@pytest.mark.parametrize(("spoilt", "out", "words"), [
-    ("disp0GT.pfm", "out.mcap", "disp0GT.pfm is not a PFM file"),
-    (None, "Box/im0.png", "is not a roverflow input log"),
-    (None, "Box", "is a folder or a device"),
-])  # fmt: skip
-def test_an_invalid_scene_is_refused_in_one_sentence(tmp_path, refused, spoilt, out, words):
-    scene = write_scene(tmp_path / "Box")
-    before = (scene / "im0.png").read_bytes()
-    if spoilt:
-        (scene / spoilt).write_bytes(b"spoilt")
-    assert words in refused("import", "middlebury", scene, tmp_path / out)
-    assert [path.name for path in tmp_path.iterdir()] == ["Box"]
-    assert (scene / "im0.png").read_bytes() == before
-
-
 def test_the_help_of_import_names_its_assumptions(capsys):
     with pytest.raises(SystemExit):
         roverflow("import", "middlebury", "--help")

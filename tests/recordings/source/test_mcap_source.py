@@ -126,6 +126,8 @@ def test_a_range_contains_complete_frames_and_their_tilts(sample, tmp_path):
      "does not contain the baseline"),
     (changed("right/camera_info", {"p": np.hstack([model().k, [[5.0], [0], [0]]]).reshape(-1)}), "left",
      f"the baseline is -0.25 m, so {LEFT} is the right camera"),
+    (changed("right/camera_info", {"p": np.array([20.0, 0, 11.5, 0, 0, 20, 7.5, -10, 0, 0, 1, 0])}), "left",
+     "is above or below that of .*rotate the images by 90 degrees before they are calibrated and logged$"),
     (changed(INFO, {"k": np.zeros(9), "p": np.zeros(12)}), "left", "is not calibrated"),
 ])  # fmt: skip
 def test_missing_streams_are_reported_with_the_remedy(tmp_path, edit, stream, sentence):
