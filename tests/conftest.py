@@ -5,6 +5,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from flow.cli.main import main
+from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import standard_types
 
 settings.register_profile("quick", deadline=None, max_examples=20)  # the first example may compile a kernel
@@ -191,6 +193,14 @@ def write_mcap(
                 writer.add_message(channels[key], log_time, data, log_time)
         extra(writer, {topic: number for (topic, *_), number in channels.items()})
         writer.finish()
+    return out
+
+
+def write_messages(out: Path, rows: Iterable[tuple[int, str, Any]]) -> Path:
+    """Write a log of messages, each (log time, topic, message), in the order of log time."""
+    with Ros2Writer(out) as writer:
+        for log_time, topic, message in sorted(rows, key=itemgetter(0)):
+            writer.write(topic, message, log_time)
     return out
 
 

@@ -26,6 +26,7 @@ FRAMES = 5
 PERIOD = 100_000_000
 START = 1_700_000_000_000_000_000
 LEFT, RIGHT, TILT = "/stereo/left/image_rect", "/stereo/right/image_rect", "/imu/data"
+SIDES = "left", "right"
 INFOS = "/stereo/left/camera_info", "/stereo/right/camera_info"
 UNSTAMPED = {"header.stamp.sec": 0, "header.stamp.nanosec": 0}  # for `changed`
 
@@ -46,6 +47,12 @@ def picture(seed: int) -> np.ndarray:
 def tilt_quaternion(number: int) -> np.ndarray:
     """The attitude at frame `number`."""
     return Rotation.from_euler("ZYX", [90, 3 + number, -5], degrees=True).as_quat()
+
+
+def stereo_rows(stamp: int, number: int) -> list[tuple[int, str, Any]]:
+    """Log time, topic and message of the calibrations and images of a frame with picture `number` on both sides."""
+    infos = [(stamp, f"/{side}/camera_info", camera_info(stamp, f"{side}_optical", model(side))) for side in SIDES]
+    return infos + [(stamp, f"/{side}/image_rect", image(stamp, f"{side}_optical", picture(number))) for side in SIDES]
 
 
 TRANSFORMS = (
@@ -85,7 +92,7 @@ def write_sample(path: Path, *edits: Edit, names: tuple[str, str] = (LEFT, RIGHT
         for number in range(FRAMES):
             stamp = START + number * PERIOD
             write(TILT, number, imu(stamp, "imu_link", tilt_quaternion(number)), stamp)
-            for side, topic in zip(("left", "right"), names, strict=True):
+            for side, topic in zip(SIDES, names, strict=True):
                 info = topic.rpartition("/")[0] + "/camera_info"
                 write(info, number, camera_info(stamp, f"{side}_optical", model(side)), stamp)
                 pixels = picture(2 * number + (side == "right"))

@@ -8,9 +8,9 @@ import pytest
 
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import camera_info, image, odometry, transform_message
 from stages.data import Pose, Transform
+from tests.conftest import write_messages
 from tests.recordings.sample_log import (
     FRAMES,
     LEFT,
@@ -32,15 +32,13 @@ from tests.recordings.sample_log import (
 
 def images(path: Path, topics: dict[str, str], infos: dict[str, str]) -> Path:
     """A log of images and calibrations alone; both: topic -> frame_id."""
-    with Ros2Writer(path) as writer:
-        for number in range(2):
-            stamp = START + number * PERIOD
-            for topic, frame in infos.items():
-                side = "right" if "right" in topic else "left"
-                writer.write(topic, camera_info(stamp, frame, model(side)), stamp)
-            for topic, frame in topics.items():
-                writer.write(topic, image(stamp, frame, picture(number)), stamp)
-    return path
+    rows = []
+    for number in range(2):
+        stamp = START + number * PERIOD
+        for topic, frame in infos.items():
+            rows.append((stamp, topic, camera_info(stamp, frame, model("right" if "right" in topic else "left"))))
+        rows += [(stamp, topic, image(stamp, frame, picture(number))) for topic, frame in topics.items()]
+    return write_messages(path, rows)
 
 
 def test_two_stereo_cameras_are_equally_good(tmp_path):
@@ -102,9 +100,8 @@ def test_truth_topics_are_used_only_if_set(tmp_path):
 
 
 def test_a_pose_among_results_is_named_but_not_used(tmp_path):
-    path = tmp_path / "log.mcap"
-    with Ros2Writer(path) as writer:
-        writer.write("/nav/odometry", odometry(Pose(START, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link")), START)
+    pose = odometry(Pose(START, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link"))
+    path = write_messages(tmp_path / "log.mcap", [(START, "/nav/odometry", pose)])
     assert "there is /nav/odometry; set 'odometry' of the source to use it" in missing_in(path)["odometry"]
     with McapSource(odometry="/nav/odometry").open(path) as log:
         assert log.topics["odometry"] == "/nav/odometry"
@@ -121,12 +118,10 @@ ODOM, MAP, WHEEL = ("odom", "base_link"), ("map", "odom"), ("base_link", "wheel"
 
 def moving(path: Path, *links: tuple[str, str], count: int = 5) -> Path:
     """A log of transforms that move, each link (parent, child) in messages of its own."""
-    with Ros2Writer(path) as writer:
-        for stamp in range(START, START + count * PERIOD, PERIOD):
-            for link in links:
-                at = Transform(*link, np.eye(3), [stamp - START, 0.0, 0.0])
-                writer.write("/tf", transform_message([(at, stamp)]), stamp)
-    return path
+    return write_messages(path, [
+        (stamp, "/tf", transform_message([(Transform(*link, np.eye(3), [stamp - START, 0.0, 0.0]), stamp)]))
+        for stamp in range(START, START + count * PERIOD, PERIOD) for link in links
+    ])  # fmt: skip
 
 
 @pytest.mark.parametrize(("links", "sentence"), [

@@ -19,6 +19,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.ros2.from_msg import stamp_of
 from stages.data import Array, Cell, ElevationMap, NavigationMap, PointCloud, Transform
+from tests.conftest import write_messages
 
 START = 1_700_000_000_000_000_000
 STEP = 0.1
@@ -63,11 +64,8 @@ def cloud(frame: int) -> PointCloud:
 
 def written(path: Path, *messages: tuple[str, Any]) -> Path:
     """A log of messages, each at its own stamp."""
-    with Ros2Writer(path) as writer:
-        for topic, message in messages:
-            stamped = message.transforms[0] if topic == "/tf" else message
-            writer.write(topic, message, stamp_of(stamped.header))
-    return path
+    stamped = [message.transforms[0] if topic == "/tf" else message for topic, message in messages]
+    return write_messages(path, [(stamp_of(at.header), *each) for at, each in zip(stamped, messages, strict=True)])
 
 
 @pytest.fixture

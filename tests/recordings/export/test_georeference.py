@@ -11,7 +11,7 @@ from recordings.importers.recording import fix
 from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.scoring.result_log import about_run
-from tests.conftest import FRAMES, roverflow
+from tests.conftest import FRAMES, roverflow, write_messages
 
 TURN, ORIGIN = np.radians(37.0), np.array([412_345.6, 5_432_100.7])  # of the map's frame in zone 33
 
@@ -36,11 +36,8 @@ def write_fixes(path, stamps, places, noise=0.0):
     """A log of fixes at places on the grid."""
     places = places + np.random.default_rng(1).normal(0, noise, places.shape)
     longitudes, latitudes = transform("EPSG:32633", "EPSG:4326", *places.T)
-    with Ros2Writer(path) as log:
-        for stamp, *place in zip(stamps, latitudes, longitudes, strict=True):
-            _, topic, message = fix(stamp, "gps", *place, 300.0)
-            log.write(topic, message, stamp)
-    return path
+    fixes = zip(stamps, latitudes, longitudes, strict=True)
+    return write_messages(path, [fix(stamp, "gps", *place, 300.0) for stamp, *place in fixes])
 
 
 @pytest.mark.parametrize(("zone", "latitude", "longitude"), [

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from recordings.errors import LogError
 from recordings.export.page_layout import Page
 from recordings.export.png_pages import disparity_page, draw, elevation_page, navigation_page
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import disparity_image, grid_map, occupancy_grid
 from recordings.sinks import colormaps
 from stages.data import LEVEL_FRAME, Array, Cell, Disparity, ElevationMap, NavigationMap
+from tests.conftest import write_messages
 
 START, STEP = 1_000_000_000, 500_000_000
 FREE, HAZARD, UNKNOWN = (colormaps.CELL_LEGEND[cell][1] for cell in (Cell.FREE, Cell.HAZARD, Cell.UNKNOWN))
@@ -46,15 +46,12 @@ def disparity(stamp: int = START) -> Disparity:
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
     """A result log of five frames; the second has no maps."""
-    path = tmp_path / "result.mcap"
-    with Ros2Writer(path) as log:
-        for n in range(5):
-            stamp = START + n * STEP
-            log.write("/nav/disparity", disparity_image(disparity(stamp)), stamp)
-            if n != 1:
-                log.write("/nav/elevation_map", grid_map(terrain(stamp)), stamp)
-                log.write("/nav/navigation_map", occupancy_grid(navigation(stamp)), stamp)
-    return path
+    stamps = [START + number * STEP for number in range(5)]
+    rows = [(stamp, "/nav/disparity", disparity_image(disparity(stamp))) for stamp in stamps]
+    for stamp in stamps[:1] + stamps[2:]:
+        rows.append((stamp, "/nav/elevation_map", grid_map(terrain(stamp))))
+        rows.append((stamp, "/nav/navigation_map", occupancy_grid(navigation(stamp))))
+    return write_messages(tmp_path / "result.mcap", rows)
 
 
 def cells_of(page: Page) -> Array:
@@ -115,9 +112,7 @@ def test_the_first_middle_and_last_frame_are_drawn_as_their_data(result, tmp_pat
 
 
 def test_a_log_without_results_is_named(tmp_path):
-    path = tmp_path / "raw.mcap"
-    with Ros2Writer(path) as log:
-        log.write("/elsewhere", grid_map(terrain()), START)
+    path = write_messages(tmp_path / "raw.mcap", [(START, "/elsewhere", grid_map(terrain()))])
     with pytest.raises(LogError, match=r"raw\.mcap contains none of /nav/disparity"):
         draw(path, tmp_path)
 

@@ -14,12 +14,11 @@ from recordings.importers.middlebury import read_middlebury, read_pfm, read_scen
 from recordings.importers.recording import FIRST_STAMP, write_recording
 from recordings.importers.rig import Rig
 from recordings.mcap.file import iter_decoded
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import from_msg as ros2
 from recordings.ros2.to_msg import disparity_image
 from recordings.scoring import score as scoring
 from stages.data import Disparity, StereoFrame
-from tests.conftest import data_folder
+from tests.conftest import data_folder, write_messages
 from tests.recordings.importers import middlebury_scene as scenes
 from tests.recordings.importers.middlebury_scene import write_pfm, write_scene
 from tests.recordings.sample_log import frame_of
@@ -39,10 +38,8 @@ def result(log: Path, frame: StereoFrame, pixels: np.ndarray) -> Path:
     """A result log with only these disparities."""
     nothing = np.zeros(pixels.shape, np.uint8)
     disparity = Disparity(frame.stamp, pixels, nothing, nothing.astype(np.float32), camera=frame.camera)
-    out = log.with_name(f"{log.stem}-nav.mcap")
-    with Ros2Writer(out) as writer:
-        writer.write("/nav/disparity", disparity_image(disparity), frame.stamp)
-    return out
+    rows = [(frame.stamp, "/nav/disparity", disparity_image(disparity))]
+    return write_messages(log.with_name(f"{log.stem}-nav.mcap"), rows)
 
 
 @pytest.mark.parametrize("order", ["<", ">"])

@@ -10,11 +10,11 @@ import pytest
 from recordings import McapSource
 from recordings.errors import LogError
 from recordings.inventory.description import describe
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AngleField, BareAngles, JoinedAngles, up_of
 from recordings.ros2.to_msg import header
 from stages.data import Tilt
+from tests.conftest import write_messages
 from tests.recordings.sample_log import START, TILT, dropped, essences, items_of, missing_in, refused_in, write_sample
 
 FACING = (0.5, -0.5, 0.5, 0.5)
@@ -48,11 +48,7 @@ def logged(
                 vector = make("geometry_msgs/msg/Vector3", x=angle, y=0.0, z=0.0)
                 message = make("geometry_msgs/msg/Vector3Stamped", header=header(stamp, "tilt_link"), vector=vector)
             rows.append((stamp + delay, topic, message))
-    angles = folder / "angles.mcap"
-    with Ros2Writer(angles) as writer:
-        for time, topic, message in sorted(rows, key=lambda row: row[0]):
-            writer.write(topic, message, time)
-    return [write_sample(folder / "sample.mcap", dropped(TILT)), angles]
+    return [write_sample(folder / "sample.mcap", dropped(TILT)), write_messages(folder / "angles.mcap", rows)]
 
 
 @pytest.mark.parametrize("late", [0, 30_000_000])

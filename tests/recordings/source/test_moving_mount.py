@@ -12,11 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import Severity
 from recordings import McapSource
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
-from recordings.ros2.to_msg import camera_info, header, image, imu, odometry, transform_message
+from recordings.ros2.to_msg import header, imu, odometry, transform_message
 from stages.data import CameraImage, Mount, Pose, Transform
-from tests.recordings.sample_log import START, TRANSFORMS, missing_in, model, picture, refused_in
+from tests.conftest import write_messages
+from tests.recordings.sample_log import START, TRANSFORMS, missing_in, refused_in, stereo_rows
 
 MS = 1_000_000
 FRAMES, PERIOD, JOINT = 6, 500 * MS, 40 * MS
@@ -50,15 +50,9 @@ def written(path: Path, messages: Messages = joints, static: tuple[Transform, ..
     for number in range(FRAMES):
         stamp = START + number * PERIOD + 61 * MS
         logged.append((stamp, "/imu/data", imu(stamp, "imu_link", np.array([0, 0, 0, 1.0]))))
-        pose = Pose(stamp, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link")
-        logged.append((stamp, "/odom", odometry(pose)))
-        for side in ("left", "right"):
-            logged.append((stamp, f"/{side}/camera_info", camera_info(stamp, f"{side}_optical", model(side))))
-            logged.append((stamp, f"/{side}/image_rect", image(stamp, f"{side}_optical", picture(number))))
-    with Ros2Writer(path) as writer:
-        for log_time, topic, message in sorted(logged, key=lambda item: item[0]):
-            writer.write(topic, message, log_time)
-    return path
+        logged.append((stamp, "/odom", odometry(Pose(stamp, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link"))))
+        logged += stereo_rows(stamp, number)
+    return write_messages(path, logged)
 
 
 Read = tuple[list[Mount], list[str], dict[str, str]]

@@ -14,15 +14,14 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Severity
 from recordings import McapSource
 from recordings.inventory.text import format_description
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
-from recordings.ros2.to_msg import camera_info, header, image, odometry, quaternion, raw_imu, transform_message
+from recordings.ros2.to_msg import header, odometry, quaternion, raw_imu, transform_message
 from recordings.source.settings import TimeOffsets
 from stages.data import Pose, Tilt, Transform
-from tests.conftest import rewrite, slow
+from tests.conftest import rewrite, slow, write_messages
 from tests.recordings.inertial.drive import Drive, drive
-from tests.recordings.sample_log import TRANSFORMS, inventory_of, missing_in, model, picture
+from tests.recordings.sample_log import TRANSFORMS, inventory_of, missing_in, stereo_rows
 
 IMU = "/imu0"
 Messages = Callable[[int, int, np.ndarray, np.ndarray], dict[str, Any]]  # number, stamp, rate, force -> by topic
@@ -37,18 +36,14 @@ def kalibr(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dict
 
 def written(path: Path, driven: Drive, messages: Messages = kalibr, *transforms: Transform) -> Path:
     """A log of a drive with five frames."""
-    with Ros2Writer(path) as writer:
-        start = int(driven.stamps[0])
-        writer.write("/tf_static", transform_message([(t, start) for t in (*TRANSFORMS, *transforms)]), start)
-        rows = zip(driven.stamps.tolist(), driven.rates, driven.forces, strict=True)
-        for number, (stamp, rate, force) in enumerate(rows):
-            for topic, message in messages(number, stamp, rate, force).items():
-                writer.write(topic, message, stamp)
-            if number % (len(driven.stamps) // 5) == 9:
-                for side in ("left", "right"):
-                    writer.write(f"/{side}/camera_info", camera_info(stamp, f"{side}_optical", model(side)), stamp)
-                    writer.write(f"/{side}/image_rect", image(stamp, f"{side}_optical", picture(number)), stamp)
-    return path
+    start = int(driven.stamps[0])
+    logged = [(start, "/tf_static", transform_message([(t, start) for t in (*TRANSFORMS, *transforms)]))]
+    for number, sample in enumerate(zip(driven.stamps.tolist(), driven.rates, driven.forces, strict=True)):
+        stamp = sample[0]
+        logged += [(stamp, topic, message) for topic, message in messages(number, *sample).items()]
+        if number % (len(driven.stamps) // 5) == 9:
+            logged += stereo_rows(stamp, number)
+    return write_messages(path, logged)
 
 
 def read(path: Path, source: McapSource | None = None, **bounds: float) -> tuple[list[Tilt], list[str], str]:

@@ -5,9 +5,9 @@ import pytest
 from recordings import McapSource
 from recordings.inventory.description import describe
 from recordings.inventory.text import format_description
-from recordings.mcap.writer import Ros2Writer
 from recordings.ros2.to_msg import imu
 from recordings.source.settings import TimeOffsets
+from tests.conftest import write_messages
 from tests.recordings.sample_log import (
     PERIOD,
     RIGHT,
@@ -71,11 +71,10 @@ def test_a_range_has_both_images_of_a_frame_by_corrected_stamps(tmp_path):
 
 @pytest.mark.parametrize("logged_late", [0, 2_000_000_000])
 def test_a_range_has_the_tilts_around_it_by_corrected_stamps(tmp_path, logged_late):
-    images, tilts = write_sample(tmp_path / "images.mcap", dropped(TILT)), tmp_path / "tilts.mcap"
-    late, first = 2_000_000_000, START - 5_000_000_000
-    with Ros2Writer(tilts) as writer:
-        for time in range(first, START + 5_000_000_000, PERIOD):
-            writer.write(TILT, imu(time + late, "imu_link", tilt_quaternion(0)), time + logged_late)
+    images, late = write_sample(tmp_path / "images.mcap", dropped(TILT)), 2_000_000_000
+    times = range(START - 5_000_000_000, START + 5_000_000_000, PERIOD)
+    rows = [(time + logged_late, TILT, imu(time + late, "imu_link", tilt_quaternion(0))) for time in times]
+    tilts = write_messages(tmp_path / "tilts.mcap", rows)
     source = McapSource(time_offset=TimeOffsets(inclinometer=-late))
     start = 5.1 - logged_late / 1e9
     events = items_of([images, tilts], source, start=start, end=start + 0.2)
