@@ -244,9 +244,10 @@ def log_motion(canvas: Canvas, stream: str, motion: CameraMotion) -> str:
 
 @logger_for(MatchHealth)
 def log_matches(canvas: Canvas, stream: str, health: MatchHealth) -> None:
-    """The matched share of all pixels and of the nearest ground, in percent."""
-    for name, part in (("all", health.all), ("near", health.near)):
-        canvas.plot(f"{stream}/{name}", 100 * part, ViewSpec(Panel.MATCHES, stream, "", stream))
+    """The matched share of all pixels and of the nearest ground, and the share of matches with a rival, in percent."""
+    for name, part in (("all", health.all), ("near", health.near), ("repeated", health.repeated)):
+        if np.isfinite(part):
+            canvas.plot(f"{stream}/{name}", 100 * part, ViewSpec(Panel.MATCHES, stream, "", stream))
 
 
 @logger_for(TiltHealth)

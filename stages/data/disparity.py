@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,11 +78,14 @@ class MatchHealth:
         That of the frame, ns.
     all, near : float
         Matched share of all pixels, and of those of the nearest ground in view.
+    repeated : float
+        Share of the sampled matches that have a rival as good at another disparity; NaN if it was not tested.
     """
 
     stamp: int
     all: float
     near: float
+    repeated: float = math.nan
 
     def __post_init__(self) -> None:
         publish_plain(self)

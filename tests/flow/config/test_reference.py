@@ -50,7 +50,7 @@ def test_data_types_list_their_fields_and_codes_their_names():
     (reason,), (rover,), (health,) = map(stage_reference, ("CellReason", "Rover", "MatchHealth"))
     assert reason.inputs["UNMATCHED"] == "10"
     assert rover.inputs["max_step"] == "highest step that is not a hazard, m"
-    assert list(health.inputs) == ["stamp", "all, near"]
+    assert list(health.inputs) == ["stamp", "all, near", "repeated"]
 
 
 def test_an_unknown_name_is_answered_with_the_nearest():
