@@ -68,7 +68,8 @@ def replay(
     logs = (Path(log),) if isinstance(log, Path | str) else tuple(map(Path, log))
     files = _files(graph, logs)
     inputs = tuple(map(str, logs)) if with_inputs else ()
-    given = {"live_pipe": live_pipe, "profile": profile, "desk": desk, "inputs": inputs, "limits": _limits(graph)}
+    given = {"live_pipe": live_pipe, "profile": profile, "desk": desk, "inputs": inputs}
+    given |= {"limits": _limits(graph), "finals": _final_disparities(graph)}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": Path(out), ".rrd": Path(rrd) if rrd is not None else None})
     stop = Stop()
@@ -78,7 +79,7 @@ def replay(
         graph.source.open(log, start=start, end=end) as opened,
         one_thread_per_call(),
     ):
-        about = _about(graph, logs, files, overrides, start, end, every)
+        about = _about(graph, logs, files, start, end, every)
         hidden = on_frame is not None or not sys.stderr.isatty()
         with _progress_bar(_frames(opened.frames, every), hidden) as (advance, say), interrupts(stop, say):
             settings: dict[str, Any] = {"workers": workers, "every": every, "rate": rate}
@@ -93,7 +94,7 @@ def replay(
 
 
 def _about(
-    graph: Graph, logs: Sequence[Path], files: Sequence[Path], overrides: Sequence[str], start: float | None,
+    graph: Graph, logs: Sequence[Path], files: Sequence[Path], start: float | None,
     end: float | None, every: Every | None,
 ) -> dict[str, str]:  # fmt: skip
     """The facts of a run that its outputs contain. logs: as the user gave them; files: of these."""
@@ -102,7 +103,7 @@ def _about(
 
     about = {
         "pipeline": graph.text,
-        "overrides": "\n".join(overrides),
+        "overrides": "\n".join(graph.changes),
         "log": names_of(logs),
         "log_digest": log_digest(files) if files else "",
         "files": "\n".join(digest_lines(getattr(graph.source, "files", ()))),
@@ -145,8 +146,18 @@ def _files(graph: Graph, logs: Sequence[Path]) -> Sequence[Path]:
     files = [file for file in find_files(logs).files if file.is_file()] if isinstance(graph.source, McapSource) else []
     for file in files:
         if about := about_run(file):
-            raise LogError(f"{file} contains results; run the log that they were made from, {about.get('log', '')}")
+            named = about.get("log") or "which it does not name"
+            raise LogError(f"{file} contains results; run the log that they were made from, {named}")
     return files
+
+
+def _final_disparities(graph: Graph) -> tuple[str, ...]:
+    """The streams of disparities that no other disparity is made from."""
+    from stages.data import Disparity
+
+    made = [node for node in graph.stages if graph.kinds.get(node.name) is Disparity]
+    read = {stream for node in made for stream in node.inputs.values()}
+    return tuple(node.name for node in made if node.name not in read)
 
 
 def _limits(graph: Graph) -> tuple[str, ...]:

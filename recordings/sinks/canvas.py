@@ -126,7 +126,7 @@ class Canvas:
 
     def keep_all(self, stream: str) -> None:
         """Leave the entities of a stream as they were in the last frame."""
-        self._now |= {path: kind for path, kind in self._before.items() if path.startswith(f"{stream}/")}
+        self._now |= {path: kind for path, kind in self._before.items() if f"{path}/".startswith(f"{stream}/")}
 
     def log_number(self, path: str, value: float, view: ViewSpec) -> None:
         """A value over time. Numbers wait for those of other frames: one by one they would be half of all calls."""

@@ -324,12 +324,13 @@ def log_navigation(canvas: Canvas, stream: str, navigation: NavigationMap) -> st
 
 @logger_for(Disparity, StereoFrame)
 def log_difference(canvas: Canvas, stream: str, disparity: Disparity, frame: StereoFrame) -> None:
-    """The difference of the images at the last disparity; hover reads it. It is large where the match is wrong."""
+    """The difference of the images at a final disparity; hover reads it. It is large where the match is wrong."""
     if stream not in canvas.full_size or disparity.pixels.shape != frame.left.shape[:2] or not canvas.pictures:
         return
     difference = colormaps.gray_difference(frame.left, frame.right, disparity.pixels, canvas.small_width)
     steps = np.rint(DIFFERENCE_STEPS * np.minimum(np.nan_to_num(difference), MAX_DIFFERENCE)).astype(np.uint16)
-    view = ViewSpec(Panel.DIFFERENCE, stream, "difference", "difference: wrong match, occlusion, glint")
+    of = f" of {stream}" if len(canvas.full_size) > 2 else ""  # more than one frame and one disparity
+    view = ViewSpec(Panel.DIFFERENCE, stream, "difference", f"difference{of}: wrong match, occlusion, glint")
     canvas.log_steps(steps, DIFFERENCE_STEPS, MAX_DIFFERENCE, view, "gray levels", cv2.COLORMAP_INFERNO)
 
 

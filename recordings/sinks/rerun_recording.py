@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,13 +99,15 @@ class RerunRecording:
             raise
         sized = [name for name, kind in streams.items() if _is(kind, Disparity) or _is(kind, StereoFrame)]
         disparities = [name for name in sized if _is(streams[name], Disparity)]
-        self._last_disparity = disparities[-1:]
+        self._finals = frozenset(settings.finals).intersection(disparities) or frozenset(disparities[-1:])
+        pairs = pairwise(disparities)
+        matched = frozenset(one for one, final in pairs if final in self._finals and one not in self._finals)
         self._canvas = Canvas(
             self._recording,
             settings.jpeg_quality,
             settings.max_width,
             sized=frozenset(sized),
-            matched=frozenset(disparities[-2:-1]),
+            matched=matched,
             counts_bytes=settings.max_megabytes > 0,
             hazard_limits={name: float(value) for name, _, value in (text.partition("=") for text in settings.limits)},
         )
@@ -252,7 +255,7 @@ class RerunRecording:
             self._rest, self._interval = self._rest / 2, 2 * self._interval
         canvas.pictures = self._frames % self._interval == 0
         self._drawn += canvas.pictures
-        canvas.full_size = frozenset([*self._last_disparity, *_last_of(StereoFrame, items)])
+        canvas.full_size = self._finals.union(_last_of(StereoFrame, items))
 
     def _draw(self, items: Mapping[str, Any]) -> list[str]:
         """Log the items of a frame; returns their captions, but for the streams inside a template."""
@@ -270,7 +273,7 @@ class RerunRecording:
             captions += texts if "/" not in stream else []
         for kinds, log in LOGGERS.items():
             if len(kinds) > 1:
-                for chosen in _together(present, kinds):
+                for chosen in _together(present, kinds, self._finals):
                     captions.append(log(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
         return [caption for caption in captions if caption]
 
@@ -326,18 +329,18 @@ def _is(kind: Any, wanted: type) -> bool:
     return isinstance(plain, type) and issubclass(plain, wanted)
 
 
-def _together(items: Mapping[str, Any], kinds: tuple[type, ...]) -> Iterator[list[str]]:
+def _together(items: Mapping[str, Any], kinds: tuple[type, ...], finals: Collection[str]) -> Iterator[tuple[str, ...]]:
     """The streams for a logger of several types: the last of each type, for every frame of reference.
 
-    A type without a frame of reference goes with every frame. Of stereo frames the last one of the camera's size goes.
+    A type without a frame of reference goes with every frame. Of stereo frames the last one of the camera's size goes,
+    of disparities each of the `finals`.
     """
     items = {stream: item for stream, item in items.items() if isinstance(item, kinds)}
     frames = {getattr(item, "frame_id", None): None for item in items.values()}
     for frame in [frame for frame in frames if frame is not None] or [None]:
         fitting = {stream: item for stream, item in items.items() if getattr(item, "frame_id", frame) == frame}
-        chosen = [_last_of(kind, fitting) for kind in kinds]
-        if all(chosen):
-            yield [stream for streams in chosen for stream in streams]
+        last = {kind: _last_of(kind, fitting) for kind in kinds if kind is not Disparity}
+        yield from product(*(last.get(kind, [stream for stream in fitting if stream in finals]) for kind in kinds))
 
 
 def _last_of(kind: type, items: Mapping[str, Any]) -> list[str]:

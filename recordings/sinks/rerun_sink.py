@@ -55,6 +55,7 @@ class RerunSink(Checked):
     desk: str = parameter("overview", "layout that the viewer opens with", choices=DESKS)
 
     live_pipe: int = set_by_run(0)  # file descriptor to a viewer, which gets the recording as it is written; 0: none
+    finals: tuple[str, ...] = set_by_run(())  # disparities that no other one is made from; none: the last is
     limits: tuple[str, ...] = set_by_run(())  # of layers, as elevation_map/step=0.17, which their scales show
 
     suffix = ".rrd"

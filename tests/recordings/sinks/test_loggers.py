@@ -9,6 +9,7 @@ import rerun as rr
 
 from recordings.sinks.canvas import MAX_POINTS, Canvas
 from recordings.sinks.loggers import DEPTH_STEPS, POINT_STEPS, same_view
+from recordings.sinks.rerun_sink import RerunSink
 from stages.data import LEVEL_FRAME, Cell, ElevationMap, PixelOrigin, Pose, StereoCamera, StereoFrame, Transform
 from tests.recordings.sinks.recorded_scene import (
     HEIGHT,
@@ -243,6 +244,18 @@ def test_what_is_unchanged_in_a_frame_stays_drawn(tmp_path):
     path = record_of(tmp_path / "run.rrd", [frame(number) for number in range(5)])
     reliefs = rows(path, "/elevation_map/relief", "EncodedImage:blob")
     assert [number for _, number, _ in reliefs] == [0, 3, 4]  # emptied in the last frame, which lacks it
+
+
+def test_a_number_that_is_unchanged_in_a_frame_leaves_no_gap_in_its_curve(tmp_path):
+    path, sink = tmp_path / "run.rrd", RerunSink()
+    sink.open(path, {"level": float}, {})
+    for number, items in enumerate([{"level": 1.0}, {}, {"level": 3.0}, {}]):
+        unchanged = frozenset({"level"}) if number == 1 else frozenset()
+        sink.write(Record(START + number, items, unchanged=unchanged))
+    sink.close({"verdict": "COMPLETE"})
+    found = {number: value for _, number, (value,) in rows(path, "/level", "Scalars:scalars")}
+    assert (found.keys(), found[0], found[2]) == ({0, 2, 3}, 1.0, 3.0)
+    assert np.isnan(found[3])  # lost
 
 
 def test_the_camera_is_drawn_at_the_sensor_of_the_cloud(rrd):

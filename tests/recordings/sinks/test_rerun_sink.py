@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -271,6 +272,20 @@ def test_intermediates_are_drawn_smaller_than_results(tmp_path):
     left = rows(path, "/rectified/left", "EncodedImage:blob")[0][2][0]
     edges = rows(path, "/disparity/superpixels", "EncodedImage:blob")[0][2][0]
     assert decoded(left, cv2.IMREAD_GRAYSCALE).shape == decoded(edges, cv2.IMREAD_GRAYSCALE).shape == (24, 32)
+
+
+def test_each_disparity_that_no_other_is_made_from_is_drawn_as_a_result(tmp_path):
+    streams = {**STREAMS, "other": Disparity}
+    items = scene() | {"other": replace(scene()["disparity"], segments=None)}
+    path = tmp_path / "both.rrd"
+    sink = RerunSink(finals=("disparity", "other"))
+    sink.open(path, streams, {})
+    sink.write(Record(START, items))
+    sink.close({"verdict": "COMPLETE"})
+    found = {chunk.entity_path for chunk in rr.chunk.RrdReader(str(path)).stream()}
+    for part in ("depth", "confidence", "difference"):
+        assert {name for name in found if name.endswith(f"/{part}")} >= {f"/disparity/{part}", f"/other/{part}"}, part
+    assert "/matched/confidence" in found
 
 
 def test_images_of_every_nth_frame_are_drawn_and_maps_of_all(tmp_path):
