@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import sys
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, distribution
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,6 +22,8 @@ def program() -> int:
     if problem := foreign_module() or overwritten_module():
         print(f"roverflow: {problem}", file=sys.stderr)
         return 2
+    for name in PACKAGES:  # before a module beside a pipeline file can take the name
+        import_module(name)
     from flow.cli.__main__ import program
 
     return program()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import fnmatch
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,16 +60,18 @@ def load(name: str | Path, overrides: Iterable[str] = (), with_sinks: bool = Tru
         raise UsageError(f"the overrides must be a list of texts, such as ['{overrides}']")
     path = pipeline_file(name)
     text = pipeline_text(path)
-    if path.parent != SHIPPED and str(path.parent.resolve()) not in sys.path:
-        sys.path.append(str(path.parent.resolve()))  # so that stages can be beside the file that uses them
-    tree = read(text, lambda line: YamlLocation(path.name, line))
+    folder = path.parent.resolve() if path.parent != SHIPPED else None
+    if folder is not None and str(folder) not in sys.path:
+        sys.path.append(str(folder))  # so that stages can be beside the file that uses them
+    tree = read(text, lambda line: YamlLocation(path.name, line, folder=folder))
     _check_parts(tree)
     tree, changes = with_settings(tree, map(Change.read, overrides))
     own = mapping(tree.value["templates"], "'templates'") if "templates" in tree.value else {}
     library = Library(own)
     expansion = Expansion(tree.value["streams"].value, library, changes)
     sinks = tree.value["sinks"].value if with_sinks else []
-    return _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)
+    graph = _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)
+    return replace(graph, changes=tuple(overrides))
 
 
 def pipeline_text(path: Path) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import filecmp
 import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import Field, dataclass, is_dataclass
 from importlib import import_module
+from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
@@ -124,13 +126,14 @@ def class_at(use: str, place: YamlLocation) -> type:
         __import__(module_name)  # it has no line of its own in a traceback, unlike importlib.import_module
     except ModuleNotFoundError as error:
         if error.name != module_name.partition(".")[0]:
-            raise place.error(f"cannot import '{module_name}': {error}{_meant(use)}") from error
+            raise place.error(f"cannot import '{module_name}': {failure(error)}{_meant(use)}") from error
         where = f"beside {place.file}" if place.line else "in the folder"
         remedy = _meant(use) or "; set PYTHONPATH to its folder"
         raise place.error(f"there is no module '{error.name}' {where} or on the Python path{remedy}") from error
     except (Exception, SystemExit) as error:  # a user's module may raise anything
         raise place.error(f"cannot import '{module_name}': {failure(error)}") from error
     module = sys.modules[module_name]
+    _check_origin(module_name.partition(".")[0], place)
     kind = getattr(module, name, None)
     if isinstance(kind, type) and is_dataclass(kind):
         if any(isinstance(value, Field) for value in vars(kind).values()):  # a base is a dataclass
@@ -143,6 +146,16 @@ def class_at(use: str, place: YamlLocation) -> type:
     listed = [n for n in getattr(module, "__all__", dir(module)) if not n.startswith("_")]
     known = [n for n in listed if is_dataclass(getattr(module, n, None))]
     raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known) or _meant(use)}")
+
+
+def _check_origin(name: str, place: YamlLocation) -> None:
+    """Refuse a module that is not the one beside the pipeline file: Python has one module of a name."""
+    file = getattr(sys.modules[name], "__file__", None) or "Python's own"
+    if place.folder is None or name in {module.partition(".")[0] for module in MODULES}:
+        return
+    for beside in (place.folder / f"{name}.py", place.folder / name / "__init__.py"):
+        if beside.is_file() and not (Path(file).is_file() and filecmp.cmp(beside, file, shallow=False)):
+            raise place.error(f"the name '{name}' is taken by another module ({file}); rename {beside}")
 
 
 def _meant(use: str) -> str:

@@ -63,7 +63,7 @@ def with_settings(tree: Value, changes: Iterable[Change]) -> tuple[Value, list[C
         if any(str(leaf.value).startswith("$") for leaf in settings[name].leaves()):
             raise settings[name].place.error(f"the setting '{name}' refers to another setting; set it to a value")
         if f"${name}" not in used:
-            raise item.place.error(f"the setting '{name}' is not used; write ${name} to use it")
+            raise item.place.error(f"the setting '{name}' is not used; write ${name} to use it, or remove it")
     for change in (_filled(change, settings) for change in of_parts):
         if change.target == "source":
             filled["source"] = change.applied(filled["source"])

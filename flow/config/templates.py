@@ -68,7 +68,12 @@ class Template:
             if key in (*self.inputs, "use", "template", "optional"):
                 raise item.place.error(f"'{key}' cannot name a parameter of '{self.name}'; choose another name")
             if key not in uses:
-                raise item.place.error(f"the parameter '{key}' of '{self.name}' is not used; write ${key} to use it")
+                unused = f"the parameter '{key}' of '{self.name}' is not used"
+                raise item.place.error(f"{unused}; write ${key} to use it, or remove it")
+        read = {str(leaf.value).partition("/")[0] for item in self.streams.values() for leaf in item.leaves()}
+        for key, item in self.inputs.items():
+            if key not in read:
+                raise item.place.error(f"no stream of '{self.name}' reads its input '{key}'; connect it, or remove it")
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, is_dataclass, replace
 from inspect import Parameter, signature
 from itertools import repeat
 from numbers import Real
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -24,12 +25,13 @@ from flow.runtime.ledger import failure
 class YamlLocation:
     """A line of a pipeline file, or a setting of the command line (`line` is then None).
 
-    used_at: for a line of a template, the place that uses the template.
+    used_at: for a line of a template, the place that uses the template; folder: of a file of the user's own.
     """
 
     file: str
     line: int | None
     used_at: YamlLocation | None = None
+    folder: Path | None = None
 
     def error(self, sentence: str) -> PipelineError:
         """The error about this place."""
@@ -80,6 +82,21 @@ class Node:
         stamps = {stamp, None, *(getattr(item, "stamp", None) for item in given)}
         if getattr(value, "stamp", None) not in stamps and not hasattr(self.actor, "flush"):
             raise StageError(f"{self.use} returned the stamp {value.stamp} ns, not that of its frame")
+        _freeze(value)
+
+
+def _freeze(value: Any) -> None:
+    """Make the arrays in a result read-only, so that a stage that keeps one cannot change it under its readers."""
+    import numpy as np  # which help does not need
+
+    if isinstance(value, np.ndarray):
+        value.flags.writeable = False
+    elif isinstance(value, Mapping | tuple | list):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            _freeze(part)
+    elif is_dataclass(value):
+        for part in vars(value).values() if hasattr(value, "__dict__") else ():
+            _freeze(part)
 
 
 @dataclass(frozen=True)
@@ -96,7 +113,7 @@ class Graph:
 
     nodes: every stream comes before its use; kinds: stream -> type; left_out: optional stream -> why a log does not
     have it; templates: stream -> the template whose output it is. The other streams of that template are called
-    `stream/...`.
+    `stream/...`; changes: the texts of --set that are in it.
     """
 
     name: str
@@ -108,6 +125,7 @@ class Graph:
     kinds: Mapping[str, type] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     templates: Mapping[str, TemplateUse] = field(default_factory=dict)
+    changes: tuple[str, ...] = ()
 
     @property
     def clock(self) -> str:

@@ -178,7 +178,8 @@ def run(
     try:
         surveys = "\n".join(f"{name}: {finding.sentence}" for name, finding in prepared.findings.items())
         fixed = "\n".join(f"{name}={json.dumps(value)}" for name, value in prepared.fixed.items())
-        facts = {**(about or {}), "surveys": surveys, "fixed": fixed}
+        given = {"pipeline": graph.text, "overrides": "\n".join(graph.changes), "log": "", **(about or {})}
+        facts = {**given, "surveys": surveys, "fixed": fixed}
         if not stop.finishing() and sinks.open(graph.frame_streams, facts, resumed):
             started = time.perf_counter() - wall
             events = _read(log.events(assembler.wanted), stop)

@@ -312,6 +312,21 @@ def test_stages_may_be_in_the_folder_of_the_pipeline_file(tmp_path):
     assert {node.name: node.use for node in loaded(tmp_path, text).nodes}["twice"] == "beside.Near"
 
 
+@pytest.mark.parametrize("name", ["near", "statistics"])
+def test_a_module_is_that_beside_the_pipeline_file_or_refused(tmp_path, name):
+    text = GOOD.replace("tests.flow.toys.Scale", f"{name}.Near")
+    for folder in ("first", "second"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"{name}.py").write_text(
+            f"from tests.flow.toys import Scale\nclass Near(Scale):\n    folder = '{folder}'\n"
+        )
+    if name == "near":
+        assert loaded(tmp_path / "first", text)
+    taken = rf"toy.yaml:\d+: the name '{name}' is taken by another module \(.*\); rename .*second/{name}.py"
+    with pytest.raises(PipelineError, match=taken):
+        loaded(tmp_path / "second", text)
+
+
 @pytest.mark.parametrize(("value", "unit", "text"), [
     (100_000_000, "ns", "100 ms"), (0.05, "m", "5 cm"), (math.radians(60), "rad", "60 deg"), (12.0, "m", "12 m"),
     (0, "ns", "0"), (128, "px", "128"),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 
 from flow.config.loader import load
@@ -107,3 +108,35 @@ def test_a_pipeline_gives_the_same_again_with_any_number_of_workers(traverse, tm
         at_once = list(pool.map(result, [2, 4]))
     assert len(first[0]) >= 6 * FRAMES
     assert at_once == [first] * 2
+
+
+@dataclass(frozen=True)
+class Sums:
+    """Adds to an array that it has returned."""
+
+    def start(self) -> list[Any]:
+        """The sum, and the parts of the last result."""
+        return [np.zeros(1)]
+
+    def __call__(self, couple: Couple, *, state: list[Any]) -> dict[str, Any]:
+        """The sum in an own type, in a mapping."""
+        state[0] += couple.value
+        return {"own": Own(state[0])}
+
+
+@dataclass(frozen=True)
+class Own:
+    """A type with an array."""
+
+    values: Any
+
+
+def test_a_stage_cannot_change_an_array_that_it_has_returned(tmp_path):
+    text = TOYS.replace("tests.flow.toys.Total", "tests.flow.runtime.test_state.Sums")
+    pipeline = graph(tmp_path, text=text)
+    ((use, _),) = pipeline.sinks
+    summary = run(pipeline, Log(numbers(3)), {use: tmp_path / "out.txt"})
+    assert {entry["detail"].partition(" (")[0] for entry in summary["ledger"]} == {
+        "ValueError: output array is read-only"
+    }
+    assert summary["frames_out"] == 1
