@@ -18,6 +18,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
+from flow.config.loader import load
+from flow.runtime.run import run
 from recordings.containers.container import RawMessage
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_grid_map, stamp_of
@@ -372,3 +374,21 @@ def test_a_printed_pipeline_is_a_pipeline_to_start_from(name, tmp_path, said):
     copy.write_text(said(0, "pipeline", name).out)
     mine, shipped = (said(0, "graph", "-p", which).out.splitlines() for which in (copy, name))
     assert mine[1:] == shipped[1:]
+
+
+def test_a_log_that_a_graph_wrote_in_python_is_a_result_like_others(traverse, tmp_path, said):
+    pipeline, out = load("fast", ["disparities=64"]), tmp_path / "out.mcap"
+    with pipeline.source.open(traverse, start=None, end=None) as log:
+        run(pipeline, log, {"recordings.McapSink": out})
+    made = "This is a result of roverflow of unknown version: pipeline fast, run on a log that it does not name."
+    assert made in said(0, "info", out).out
+    plain = tmp_path / "plain.mcap"
+    assert roverflow("run", traverse, "-p", "fast", *SMALL, "--no-rrd", "-o", plain) == 0
+    for one, other in ((out, plain), (plain, out)):
+        assert "equal: all " in said(0, "diff", one, other).out
+    assert "run the log that they were made from, which it does not name" in said(2, "run", out).err
+    assert said(0, "verify", out, "--log", traverse)
+
+
+def test_debug_may_stand_before_the_command(said):
+    assert said(0, "--debug", "graph", "-p", "fast").out == said(0, "graph", "-p", "fast").out

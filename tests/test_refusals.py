@@ -301,7 +301,8 @@ def test_maps_beyond_memory_are_refused_before_the_run(settings, printed, refuse
     (["recordings.McapSink", "another.Another"], "several sinks write .mcap files, but a run writes only one"),
 ])  # fmt: skip
 def test_a_sink_without_an_output_is_refused(traverse, tmp_path, refused, sinks, printed):
-    (tmp_path / "another.py").write_text("from recordings import McapSink\nclass Another(McapSink):\n    pass\n")
+    if "another.Another" in sinks:
+        (tmp_path / "another.py").write_text("from recordings import McapSink\nclass Another(McapSink):\n    pass\n")
     listed = ", ".join(f"{{use: {use}}}" for use in sinks)
     shipped = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
     (tmp_path / "own.yaml").write_text(f"{shipped.partition('sinks:')[0]}sinks: [{listed}]\n")

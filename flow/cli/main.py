@@ -65,7 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace:
     """The options of a command line. An unknown name ends the program with the nearest valid one."""
-    options, unknown = parser().parse_known_args(given or ["--help"])
+    first = given[:1] == ["--debug"]  # it may stand before the command
+    options, unknown = parser().parse_known_args([*given[1:], "--debug"] if first else given or ["--help"])
     if unknown:
         valid = [option for action in options.parser._actions for option in action.option_strings]
         near = [each for each in valid if nearest(unknown[0].lstrip("-"), [each.lstrip("-")])]  # all share the dashes

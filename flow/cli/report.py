@@ -75,11 +75,14 @@ def report(summary: dict[str, Any], compiled: bool = False) -> None:
     found = [summary["surveys"], summary["findings"]]
     for line in [line for part in found for line in lines(part, Severity.NOTE)]:
         say(f"  {line}")
-    for reason, number in by_cause(summary["drops"]):
-        first = next(entry for entry in summary["ledger"] if entry["reason"] == reason)
+    for reason, _ in by_cause(summary["drops"]):
         begin = summary.get("log_begin" if reason == LossReason.UNREADABLE else "first_stamp")  # log times, stamps
-        place = f"{first['stream']} at {_moment(first['stamp'], begin)}"
-        say(f"  {number} {reason}, first: {place}: {first['detail']}")
+        lost = [entry for entry in summary["ledger"] if entry["reason"] == reason]
+        by_stage = [entry["stage"] if reason == LossReason.FAILED else "" for entry in lost]
+        for stage in dict.fromkeys(by_stage):
+            first = lost[by_stage.index(stage)]
+            place = f"{first['stream']} at {_moment(first['stamp'], begin)}"
+            say(f"  {by_stage.count(stage)} {reason}, first: {place}: {first['detail']}")
     if summary["rate"] is not None and (latency := summary["latency_seconds"]):
         late = f"{latency['median']:.2f} s after it, at most {latency['maximum']:.2f} s"
         say(f"  at {summary['rate']:g} times the pace of the log: the results of a frame are there {late}")

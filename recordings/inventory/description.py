@@ -110,7 +110,8 @@ def _run(log: McapLog) -> str:
     """The run that wrote a result log, in words; empty for another log."""
     about = about_run(log.path)
     pipeline = pipeline_of(log.path) if log.file.indexed else "unknown"
-    return f"roverflow {about['roverflow']}: pipeline {pipeline}, run on {about['log']}" if about else ""
+    version, named = about.get("roverflow", "of unknown version"), about.get("log") or "a log that it does not name"
+    return f"roverflow {version}: pipeline {pipeline}, run on {named}" if about else ""
 
 
 def _topics(log: McapLog) -> list[dict[str, Any]]:

@@ -73,6 +73,36 @@ def test_a_variant_whose_maps_do_not_fit_the_truth_says_so(traverse, tmp_path, s
     assert "\nB not scored: /nav/elevation_map: its cells are 0.1 m wide, the truth's 0.05 m; " in output
 
 
+STRICT = """
+from dataclasses import dataclass
+from stages import StereoFrame
+
+
+@dataclass(frozen=True)
+class Strict:
+    limit: int = 0
+
+    def __call__(self, frame: StereoFrame) -> StereoFrame:
+        if self.limit > 1:
+            raise ValueError("too strict")
+        return frame
+"""
+
+
+def test_a_variant_whose_stage_fails_says_why_and_the_others_are_scored(traverse, tmp_path, said):
+    (tmp_path / "strict.py").write_text(STRICT)
+    own = said(0, "pipeline", "fast").out.replace("frame: rectified", "frame: passed")
+    text = own.replace("streams:", "streams:\n  passed: {use: strict.Strict, frame: rectified}", 1)
+    (tmp_path / "own.yaml").write_text(text)
+    words = ("try", traverse, "--at", "0.5", "-p", tmp_path / "own.yaml")
+    values = [f"--set=passed.limit={number}" for number in (2, 1)]
+    output = said(0, *words, *values, "-o", tmp_path / "try.rrd").out
+    assert "note: B lost 1 frame, first in passed@B: ValueError: too strict (strict.py, line 12" in output
+    rows = {line.split()[0]: line.split()[1:] for line in output.splitlines() if re.match(r" +[A-C] +[-\d]", line)}
+    assert (rows["A"] == rows["C"], set(rows["B"])) == (True, {"-"})
+    assert "\nB not scored: it contains none of /nav/disparity, " in output
+
+
 def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, said):
     change = ("-p", "fast", "--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
     output = said(0, "try", traverse, "--at", "1.05", "--before", FRAMES, *change).out

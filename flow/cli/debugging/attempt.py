@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -108,16 +109,20 @@ def _errors(paths: dict[str, Path], truth: Sequence[Path]) -> tuple[dict[str, li
     """
     from recordings.errors import LogError
     from recordings.scoring.score import score
-    from recordings.scoring.table import brief_figures
+    from recordings.scoring.table import SCORES, brief_figures
 
     errors, unscored = dict[str, list[float]](), list[str]()
     for label, path in paths.items():
         try:
             found = score(path, truth, whole=False)
-        except LogError:  # the log has no truth
-            return {}, []
+        except LogError as error:
+            errors[label] = [math.nan] * len(SCORES[1:])
+            unscored.append(f"{label} not scored: {str(error).replace(f'{path} ', 'it ', 1)}")
+            continue
         errors[label] = brief_figures(found)
         unscored += [f"{label} not scored: {topic}: {why}" for topic, whys in found.unscored.items() for why in whys]
+    if all(math.isnan(figure) for figures in errors.values() for figure in figures):  # the log has no truth
+        return {}, []
     return errors, unscored
 
 

@@ -64,7 +64,7 @@ def input_of(
     from recordings.errors import LogError
     from recordings.scoring.result_log import about_run, input_beside
 
-    named, given = about_run(result)["log"], input_beside(result)
+    named, given = about_run(result).get("log") or "which it does not name", input_beside(result)
     if log is not None:
         given = [Path(log)] if isinstance(log, Path | str) else [*map(Path, log)]
     for file in given:

@@ -96,6 +96,11 @@ def run_variants(
     through = stamps_of(paths["A"], results=True).size if all(path.exists() for path in paths.values()) else 0
     if not through:
         raise no_frame(part, summary)
+    for label, names in variants.names.items():
+        lost = [one for one in summary["ledger"] if one["stage"] in names.values() and one["stamp"] >= part.stamp]
+        if lost:
+            frames_lost = counted(len({one["stamp"] for one in lost}), "frame")
+            notes.append(f"note: {label} lost {frames_lost}, first in {lost[0]['stage']}: {lost[0]['detail']}")
     if through < part.frames:
         says_why = f"roverflow run --start {max(0, part.first):.3f} --end {part.end:.3f} says why"
         notes.append(f"note: {counted(part.frames - through, 'frame')} gave no result; {says_why}")

@@ -76,8 +76,10 @@ def _regional(options: argparse.Namespace) -> int:
     from flow.cli.debugging.regional_explanation import why_regional
     from recordings.comparison.text import moment
 
-    if options.cell is None or options.out is not None:
-        raise UsageError(f"'{options.map}' is a regional map: give --cell in its frame; it has no picture of pixels")
+    if options.cell is None:
+        raise UsageError(f"'{options.map}' is a regional map: give --cell in its frame")
+    if options.out is not None:
+        raise UsageError(f"'{options.map}' is a regional map, which has no picture of pixels; leave out --out")
     found = why_regional(options.result, options.at, options.cell, log=options.log, stream=options.map)
     verdict, reason = found.verdict.name.lower(), found.reason.name.lower()
     place = f"({found.x:.3f}, {found.y:.3f}) m in '{found.frame_id}'"
