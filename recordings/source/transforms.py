@@ -13,12 +13,16 @@ import numpy as np
 from recordings.errors import LogError
 from recordings.ros2.from_msg import transform_of
 from stages.data import Array, Transform
-from stages.data.rotations import nearest_rotation
+from stages.data.rotations import angle_of, nearest_rotation
 
 # The axes of a camera (x right, y down, z forward) that looks straight ahead, in the rover's (x forward, y left, z up).
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 MAX_ROUNDING = 0.01  # of the products of a rotation's axes; some files have two digits
-TRANSFORM_ATOL = 1e-6  # m and matrix elements; two transforms that differ by more contradict each other
+TRANSFORM_ATOL = 1e-6  # m and matrix elements; two transforms that differ by more are not the same
+# Two publishers of one mount round its numbers differently. What is less than any mount is measured to is no
+# contradiction.
+MAX_SAME_SHIFT = 1e-3  # m
+MAX_SAME_TURN = float(np.deg2rad(0.05))  # rad
 
 
 def orthonormal(matrix: Array, where: str) -> Array:
@@ -70,8 +74,12 @@ class TransformTree:
             self.edges.setdefault(parent, {})[child] = transform
             self.edges.setdefault(child, {})[parent] = transform.inverse()
             self.parents[child] = parent
-        elif not are_same(known, transform) and (child not in self.calibrated or self.parents.get(child) == parent):
-            raise LogError(f"the transform '{parent}' <- '{child}' contradicts an earlier one; the earlier one is used")
+        elif (off := _contradiction(known, transform)) and (
+            child not in self.calibrated or self.parents.get(child) == parent
+        ):
+            raise LogError(
+                f"the transform '{parent}' <- '{child}' contradicts an earlier one by {off}; the earlier one is used"
+            )
 
     def between(self, parent: str, child: str) -> Transform | None:
         """The transform from frame `child` to `parent` by the shortest path; None if nothing connects them."""
@@ -125,3 +133,14 @@ def are_same(one: Transform, other: Transform) -> bool:
     """Whether two transforms differ by rounding only."""
     off = max(np.abs(one.rotation - other.rotation).max(), np.abs(one.translation - other.translation).max())
     return bool(off <= TRANSFORM_ATOL)
+
+
+def _contradiction(one: Transform, other: Transform) -> str:
+    """By how much two transforms of the same frames contradict each other; empty if they do not."""
+    shift = float(np.linalg.norm(one.translation - other.translation))
+    turn = angle_of(one.rotation.T @ other.rotation)
+    if shift <= MAX_SAME_SHIFT and turn <= MAX_SAME_TURN:
+        return ""
+    length = f"{shift * 100:.1f} cm" if shift < 0.0995 else f"{shift * 100:.0f} cm" if shift < 1 else f"{shift:.3g} m"
+    angle = float(np.rad2deg(turn))
+    return f"{length} and {angle:{'.2f' if 0.005 <= angle < 1 else '.1f'}} degrees"

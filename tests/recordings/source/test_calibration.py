@@ -270,7 +270,9 @@ def test_a_calibration_without_a_frame_has_that_of_its_images(tmp_path):
 
 @pytest.mark.parametrize(("more", "sentence"), [
     (Transform("mast", "imu_link", np.eye(3), [0, 0, 1]), "'imu_link' has two parents, 'base_link' and 'mast'"),
-    (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4001]), "contradicts an earlier one"),
+    (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4011]), "one by 0.1 cm and 0.0 degrees; the"),
+    (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.7]), "an earlier one by 30 cm and 0.0 degrees; the"),
+    (Transform("base_link", "imu_link", turned("z", 90.06), [0, 0, 0.4]), "one by 0.0 cm and 0.06 degrees; the"),
     (Transform("imu_link", "base_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
     (Transform("left_optical", "imu_link", np.eye(3), [0, 0, 0]), "contradicts an earlier one"),
     (Transform("imu_link", "imu_link", np.eye(3), [0, 0, 1]), "contradicts an earlier one"),
@@ -321,8 +323,13 @@ def test_a_long_chain_of_transforms_is_followed():
         assert frames.between(*unjoined) is None
 
 
-def test_a_repeated_transform_is_no_contradiction(tmp_path):
-    edit = mounted(*TRANSFORMS, *TRANSFORMS, TRANSFORMS[0].inverse())
+@pytest.mark.parametrize("again", [
+    (*TRANSFORMS, TRANSFORMS[0].inverse()),
+    (Transform("base_link", "imu_link", turned("z", 90), [0, 0, 0.4009]),),
+    (Transform("base_link", "imu_link", turned("z", 90.04), [0, 0, 0.4]),),
+], ids=["the same", "0.9 mm", "0.04 degrees"])  # fmt: skip
+def test_a_repeated_transform_is_no_contradiction(tmp_path, again):
+    edit = mounted(*TRANSFORMS, *again)
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert not [item for _, _, item in log.events() if isinstance(item, Exception)]
         assert log.resolution.static.listed() == ["base_link <- imu_link", "base_link <- left_optical"]
