@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.discovery.discover import VISUAL
+from recordings.inventory.poses import describe_poses
 from recordings.inventory.search_range import search_range
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory
@@ -88,6 +89,7 @@ def describe(
             "tilt_delay_s": float(np.median(of_tilts)) / 1e9 if of_tilts else None,
             "tilt_offset_s": log.time_offset("inclinometer") / 1e9,
         },
+        "poses": describe_poses(log, left, _is_verified(log), damage.add),
         "transforms": resolution.static.listed(),
         "mount": _mount(log),
         "search_range": _search_range(log),

@@ -33,7 +33,7 @@ def format_description(description: dict[str, Any]) -> str:
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     if all(side in d["streams"] for side in CAMERAS):
         lines.append(_frame_line(d["frames"]))
-        lines += [f"doubtful: {doubt}" for doubt in _stamp_doubts(d["frames"])]
+        lines += [f"doubtful: {doubt}" for doubt in (*_stamp_doubts(d["frames"]), *_pose_doubts(d))]
     if d["mount"]:
         base, position = d["mount"]["base"], [round(value, 4) for value in d["mount"]["position"] or ()]
         lines.append("mount: camera position unknown" if base is None else f"mount: camera at {position} m in '{base}'")
@@ -73,6 +73,21 @@ def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
             f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them; else {corrected}"
         )
         yield f"tilts arrive in the log {late:.1f} s later than images of the same stamp; {remedy}"
+
+
+def _pose_doubts(d: dict[str, Any]) -> Iterator[str]:
+    """What is unusual about the poses, a sentence each, with the setting for it."""
+    poses, frames = d["poses"], d["frames"]
+    if poses is None:
+        return
+    if poses["unreadable"] and not poses["readable"]:
+        remedy = "--set source.odometry=visual makes a run do without them"
+        yield f"no pose on {d['streams']['odometry']} can be read; {remedy}"
+    late = (poses["delay_s"] or 0) - (frames["delay_s"] or [0, 0])[1]
+    if poses["readable"] and abs(late) > MAX_LATENESS_NS / 1e9 and not poses["images_covered"]:
+        corrected = f"--set source.time_offset.odometry={poses['offset_s'] + late:.3f}s corrects the poses"
+        differ = f"the stamps of poses and images are of clocks that differ by {abs(late):.1f} s"
+        yield f"{differ}; record both with one; {corrected}, if both are logged equally soon"
 
 
 def _table(topics: list[dict[str, Any]], roles: dict[str, str]) -> list[str]:
