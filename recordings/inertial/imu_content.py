@@ -29,7 +29,8 @@ class ImuContent:
 def imu_content(messages: DecodedTopics, topic: str) -> ImuContent:
     """What the messages of an Imu contain, by a sample.
 
-    An orientation that is 1 in all of several messages with accelerations is a default of the driver.
+    An orientation that is 1 in all of several messages with accelerations is a default of the driver. One whose roll
+    and pitch are exactly 0 in all of them is a heading alone.
     """
     why, seen, forces, rates = "it has no messages", list[tuple[float, ...]](), list[tuple[float, ...]](), False
     for message in messages.sample(topic, lambda message: message):
@@ -48,6 +49,8 @@ def imu_content(messages: DecodedTopics, topic: str) -> ImuContent:
         return ImuContent("" if seen else f"{why}; its accelerations contain no gravity", gravity, rates)
     if gravity and len(seen) > 1 and set(seen) == {_IDENTITY}:
         return ImuContent("it is 1 in every message, as from a driver without an orientation", gravity, rates)
+    if gravity and len(seen) > 1 and all(x == y == 0 for x, y, _, _ in seen):
+        return ImuContent("its roll and pitch are 0 in every message, so it is a heading alone", gravity, rates)
     return ImuContent("" if seen else why, gravity, rates)
 
 

@@ -18,6 +18,7 @@ from stages.localisation.tilt.causes import (
     MAX_LARGE_OFFSET,
     MAX_OFFSET,
     MIN_FRAMES,
+    MIN_OFFSET,
     Cause,
     Evidence,
     Fit,
@@ -32,6 +33,8 @@ NOISE = float(np.deg2rad(0.2))  # rad, prior for a tilt, against which the camer
 MIN_NOISE = float(np.deg2rad(0.05))  # rad
 MAX_NOISE = float(np.deg2rad(2.0))  # rad; beyond it tilt and camera disagree, whatever the best explanation
 MAX_SOUND_NOISE = float(np.deg2rad(0.5))  # rad; beyond it large time offsets are tried
+MAX_DELAY_NOISE = float(np.deg2rad(1.0))  # rad; a sound tilt of noise 0.6 degrees has less, and so has a late one
+MIN_DELAY_RATIO = 2.0  # of residuals without and with a large time offset; one of seconds fits any tilt a little
 MAX_SLOPE = float(np.deg2rad(20))  # rad; ground that is steeper in every frame means a wrong tilt
 MIN_GAIN = 25.0  # of a fault's score over that of no fault: five sigma
 MIN_RIVAL_GAIN = 10.0  # over the scores of other faults; those within it are named too
@@ -76,6 +79,14 @@ class _Hypotheses(NamedTuple):
     def residual(self, cause: Cause) -> float:
         """RMS angle, rad, between tilt and camera under a cause."""
         return float(self.noise * np.sqrt(cause.misfit / self.degrees_of_freedom))
+
+    def explains(self, cause: Cause) -> bool:
+        """Whether tilt and camera agree well enough under a time offset to name it; true of other causes."""
+        if cause is not self.offset:
+            return True
+        left = self.residual(cause)
+        large = cause.size * MIN_OFFSET > MAX_OFFSET
+        return left <= MAX_DELAY_NOISE and not (large and self.residual(self.sound) < MIN_DELAY_RATIO * left)
 
 
 def diagnose(evidence: Evidence) -> Diagnosis:
@@ -134,8 +145,9 @@ def _faulty(tried: _Hypotheses, best: Cause) -> Diagnosis:
     variance = tried.variance
     limit = best.score(variance) + MIN_RIVAL_GAIN
     rivals = [c for c in tried.faults if c is not best and c.size > 1 and c.score(variance) < limit]
-    if tried.residual(best) > MAX_NOISE:
+    if tried.residual(best) > MAX_NOISE or not tried.explains(best):
         return _inconsistent(tried)
+    rivals = [rival for rival in rivals if tried.explains(rival)]
     faults = [best.fault, *(rival.fault for rival in rivals if not _same(best, rival))]
     remedy = best.remedy
     if best is tried.mount and tried.offset is None:

@@ -72,10 +72,17 @@ def default(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dic
     return {IMU: message}
 
 
+def heading(number: int, stamp: int, rate: np.ndarray, force: np.ndarray) -> dict[str, Any]:
+    message = kalibr(number, stamp, rate, force)[IMU]
+    message.orientation = quaternion(Rotation.from_euler("z", number / 1000).as_quat())
+    return {IMU: message}
+
+
 @pytest.mark.parametrize(("messages", "why"), [
     (kalibr, "is not a rotation: [0.0, 0.0, 0.0, 0.0]"),
     (absent, "the Imu marks its orientation as absent"),
     (default, "it is 1 in every message"),
+    (heading, "its roll and pitch are 0 in every message"),
 ])  # fmt: skip
 def test_up_is_estimated_where_an_imu_has_no_orientation(tmp_path, messages, why):
     driven = drive(seconds=12)

@@ -94,6 +94,14 @@ def test_a_time_offset_is_named_with_its_size(drive, late):
     assert f"Set source.time_offset.inclinometer to {'-' if late > 0 else ''}{size[1]} ms" in found.sentence
 
 
+@pytest.mark.parametrize(("seed", "slope", "frames"), [(1, 2.0, 20), (2, 2.0, 50), (3, 4.0, 20)])
+def test_a_tilt_that_does_not_follow_the_rover_is_not_early_or_late(seed, slope, frames):
+    """A delay of seconds leaves half of the difference to a tilt that is level whatever the rover does."""
+    found = diagnose(Drive(seed, slope).evidence(frames, change=lambda up: np.array([0.0, 0.0, 1.0])))
+    assert found.fault == "inconsistent", found.sentence
+    assert "source.time_offset" not in found.sentence
+
+
 @pytest.mark.parametrize("late", [0.2, 0.1, -0.2])
 def test_few_frames_name_a_time_offset_beside_a_wrong_mount(late):
     found = diagnose(Drive(3, 5.0, 0.1).evidence(frames=8, late=late))
