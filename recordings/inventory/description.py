@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.discovery.discover import VISUAL
 from recordings.inventory.poses import describe_poses
-from recordings.inventory.search_range import search_range
+from recordings.inventory.search_range import UPSIDE_DOWN, search_range
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory
 from recordings.source.log import McapLog
@@ -259,7 +259,11 @@ def _search_range(log: McapLog) -> dict[str, Any] | None:
         return None
     left, right = cameras
     camera = StereoCamera.from_models(left.model, right.model, left.image_frame, left.rectified)
-    return search_range(camera, mount.camera_from_inclinometer @ tilt.up, float(mount.base_from_camera.translation[2]))
+    up, base = mount.camera_from_inclinometer @ tilt.up, mount.base_from_camera
+    found = search_range(camera, up, float(base.translation[2]))
+    if found is not None and (base.rotation @ up)[2] < 0:
+        found["doubt"] = UPSIDE_DOWN
+    return found
 
 
 def _mount(log: McapLog) -> dict[str, Any] | None:

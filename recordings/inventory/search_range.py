@@ -10,6 +10,11 @@ import numpy as np
 
 from stages.data import Array, StereoCamera
 
+UPSIDE_DOWN = (
+    "by the tilt the rover is upside down, so no ground is below the horizon: z of the inclinometer's frame, or of the "
+    "world of its orientation, points down (FRD, NED), or accelerations have the opposite sign; correct /tf_static, or "
+    "convert the messages to frames whose z points up"
+)
 ROCK = 0.3  # m; height above the ground of what should still be within the search range
 MAX_DISPARITIES = 1024  # that matchers search
 

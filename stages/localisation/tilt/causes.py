@@ -26,6 +26,22 @@ MIN_OFFSET = 0.08  # s, of a time offset that is a fault
 MAX_OFFSET, MAX_LARGE_OFFSET = 0.6, 3.0  # s, of the time offsets tried; the large ones if the tilt is not sound
 MAX_FRAME_GAP = 1.5  # s, for a time offset to be measurable
 
+_Z_DOWN = "Check the axes of the inclinometer's driver; z of its frame must point up where /tf_static has it so."
+_TURN = (
+    "z of its frame points down, as in FRD. Rotate the inclinometer's frame by 180 degrees about {axis} in /tf_static, "
+    "or convert the messages to a frame whose z points up (FLU)."
+)
+_REVERSED = (
+    "If the log has orientations, z of their world points down, as in NED; convert them to a world with z up (ENU). If "
+    "it has accelerations, their sign is opposite: at rest an accelerometer reads +9.8 m/s2 along the axis that points "
+    "up."
+)
+_UPSIDE_DOWN = {  # exchanged, signs of pitch and roll -> fault and remedy, where the sign of up is flipped too
+    (False, -1, -1): ("up and down are exchanged", _REVERSED),
+    (False, 1, -1): ("the signs of roll and up are flipped", _TURN.format(axis="x")),
+    (False, -1, 1): ("the signs of pitch and up are flipped", _TURN.format(axis="y")),
+}
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
@@ -128,9 +144,12 @@ def _exchanges() -> tuple[tuple[str, str, Array], ...]:
             parts.append(f"{flipped} {'are' if len(names) > 1 else 'is'} flipped")
         settings = ["the fields of source.pitch and source.roll"] if swapped else []
         settings += [f"source.{name}.sign" for name in names if name != "up"]
-        settings += ["the direction of up"] if z < 0 else []
+        fault = " and ".join(parts)
         remedy = f"Check the axes of the inclinometer's driver; for a log of bare angles, {' and '.join(settings)}."
-        found.append((" and ".join(parts), remedy, undo))
+        if z < 0:  # no setting of bare angles does that
+            own, remedy = _UPSIDE_DOWN.get((swapped, x, y), (fault, _Z_DOWN))
+            fault = f"{own}: by the tilt the rover is upside down"
+        found.append((fault, remedy, undo))
     return tuple(found)
 
 

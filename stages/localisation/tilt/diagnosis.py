@@ -157,10 +157,19 @@ def _faulty(tried: _Hypotheses, best: Cause) -> Diagnosis:
         )
     fault = " or ".join(faults)
     sentence = (
-        f"{fault[0].upper()}{fault[1:]}. Without this fault tilt and camera agree to {degrees(tried.residual(best))}, "
-        f"with it to {degrees(tried.residual(tried.sound))} ({tried.frames} frames). {remedy}"
+        f"{fault[0].upper()}{fault[1:]}. Without this fault {_agreement(tried, best)} ({tried.frames} frames). {remedy}"
     )
     return Diagnosis(fault, sentence, True)
+
+
+def _agreement(tried: _Hypotheses, best: Cause) -> str:
+    """How much better the camera agrees with the tilt under a cause, by its motion, or else by the ground in view."""
+    if (tried.sound.misfit - best.misfit) / tried.variance > MIN_GAIN:
+        left, whole = (degrees(tried.residual(cause)) for cause in (best, tried.sound))
+        return f"tilt and camera agree to {left}, with it to {whole}"
+    before, after = (GROUND_SIGMA * np.sqrt(cause.ground) for cause in (tried.sound, best))  # chords of a unit circle
+    left, whole = (degrees(2 * np.arcsin(min(chord / 2, 1))) for chord in (after, before))
+    return f"the ground in view is {left} off level on average, with it {whole if before < np.sqrt(2) else 'overhead'}"
 
 
 def _inconsistent(tried: _Hypotheses) -> Diagnosis:

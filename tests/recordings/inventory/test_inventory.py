@@ -184,6 +184,13 @@ def test_images_that_a_wider_tolerance_would_pair_are_doubted(tmp_path, offset, 
     assert not doubt or inventory_of(path, slop=8_000_000)["frames"]["pairs"] == FRAMES
 
 
+def test_a_tilt_of_a_frame_whose_z_points_down_is_doubted(tmp_path):
+    about_x = {"orientation.x": 1.0, "orientation.y": 0.0, "orientation.z": 0.0, "orientation.w": 0.0}
+    doubt = "doubtful: by the tilt the rover is upside down"
+    assert doubt in text_of(tmp_path, changed(TILT, about_x))
+    assert doubt not in text_of(tmp_path)
+
+
 def test_a_calibration_of_another_image_size_is_doubted(tmp_path):
     doubt = "cx of 11.5 px lies in the outer fifth of 60x32 images: check that the calibration is for this size"
     assert f"doubtful: {doubt}" in text_of(tmp_path, changed("camera_info", {"width": 60, "height": 32}))

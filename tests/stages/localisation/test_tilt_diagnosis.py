@@ -66,6 +66,28 @@ def test_a_rover_that_turns_on_a_slope_has_no_fault(slope, yaw):
     assert found.fault == "", found.sentence
 
 
+@pytest.mark.parametrize(
+    ("signs", "fault", "remedy"),
+    [
+        ([-1, -1, -1], "up and down are exchanged", "at rest an accelerometer reads +9.8"),
+        ([1, -1, -1], "the signs of roll and up are flipped", "Rotate the inclinometer's frame by 180 degrees about x"),
+        ([-1, 1, -1], "the signs of pitch and up are flipped", "by 180 degrees about y in /tf_static"),
+    ],
+)
+def test_a_tilt_that_is_upside_down_is_named_with_the_frame_to_correct(signs, fault, remedy):
+    found = diagnose(DRIVES[0].evidence(change=lambda up: up * signs))
+    assert found.fault == f"{fault}: by the tilt the rover is upside down", found.sentence
+    assert remedy in found.sentence
+    assert "source." not in found.sentence
+
+
+def test_the_ground_separates_up_from_down_and_the_sentence_names_it():
+    found = diagnose(DRIVES[0].evidence(change=lambda up: -up))
+    ground = r"Without this fault the ground in view is \d\.\d+ degrees off level on average, with it overhead \("
+    assert re.search(ground, found.sentence), found.sentence
+    assert "agree to" not in found.sentence
+
+
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("turned", [about("x", 5), about("y", -5), about("z", 5), about("z", -5), about("x", 90)])
 def test_a_wrong_mount_is_named_with_its_correction(drive, turned):
