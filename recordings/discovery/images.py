@@ -76,11 +76,7 @@ def find_images(topics: Sequence[Topic], settings: LogSettings, found: Discovere
         found.remedies["left"] = [Remedy({"left": left.name, "right": right.name}) for left, right in equal]
         return
     found.chosen.update(left=equal[0][0].name, right=equal[0][1].name)
-    why = (
-        "the only stereo pair"
-        if len(pairs) == 1
-        else f"the best of {len(pairs)} pairs: rectified, uncompressed, colour"
-    )
+    why = f"the best of {len(pairs)} pairs: {_merits(equal[0])}" if len(pairs) > 1 else "the only stereo pair"
     found.why.update(left=why, right=why)
 
 
@@ -146,3 +142,10 @@ def _rank(pair: tuple[Topic, Topic]) -> tuple[bool, int, bool]:
     """Rectified before raw, uncompressed before compressed before video, colour before gray."""
     name = pair[0].name
     return looks_rectified(name), -IMAGES.index(pair[0].schema), "color" in name or "rgb" in name
+
+
+def _merits(pair: tuple[Topic, Topic]) -> str:
+    """What a pair has by its names and its type, of that by which it is ranked."""
+    rectified, place, colour = _rank(pair)
+    merits = {"rectified": rectified, "uncompressed": place == 0, "colour": colour}
+    return ", ".join(merit for merit, has in merits.items() if has) or "none is rectified or uncompressed"

@@ -120,8 +120,9 @@ def _topics(log: McapLog) -> list[dict[str, Any]]:
     found = []
     for channel in sorted(log.file.channels.values(), key=lambda channel: (channel.topic, channel.number)):
         times = log.file.times({channel.number})
-        gaps = np.diff(times)
-        span = float(times[-1] - times[0]) / 1e9 if times.size > 1 else 0.0
+        spaced = times[:0] if channel.topic.endswith("tf_static") else times  # each of its publishers logs once
+        gaps = np.diff(spaced)
+        span = float(times[-1] - times[0]) / 1e9 if gaps.size else 0.0
         found.append(
             {
                 "topic": channel.topic,

@@ -192,3 +192,16 @@ def test_an_imu_that_begins_invalid_is_an_inclinometer(tmp_path, monkeypatch, in
     with McapSource().open(write_sample(tmp_path / "log.mcap", edit)) as log:
         assert log.missing == {}
         assert [stream for _, stream, _ in losses_in(log.events())] == ["inclinometer"] * invalid
+
+
+@pytest.mark.parametrize(("names", "merits"), [
+    (("image_rect", "image_raw"), "rectified, uncompressed"),
+    (("image_rect_color", "image_rect"), "rectified, uncompressed, colour"),
+    (("image_rgb", "image_gray"), "uncompressed, colour"),
+])  # fmt: skip
+def test_the_reason_of_a_choice_is_what_the_chosen_pair_has(tmp_path, names, merits):
+    topics = dict.fromkeys([f"/cam/{side}/{name}" for side in ("left", "right") for name in names], "a")
+    infos = dict.fromkeys([f"/cam/{side}/camera_info" for side in ("left", "right")], "a")
+    with McapSource().open(images(tmp_path / "log.mcap", topics, infos)) as log:
+        assert log.resolution.chosen["left"] == f"/cam/left/{names[0]}"
+        assert log.resolution.why["left"] == f"the best of 2 pairs: {merits}"

@@ -19,7 +19,7 @@ from recordings.inventory.description import Damage, describe
 from recordings.inventory.text import format_description
 from recordings.mcap.file import McapFile
 from stages.data import Transform
-from tests.conftest import patch, rewrite
+from tests.conftest import mcap_rows, patch, rewrite
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -61,6 +61,14 @@ def test_rates_and_gaps_are_those_of_the_log(description):
     assert topics["/tf_static"]["hz"] is None
     assert description["indexed"]
     assert description["missing"] == {}
+
+
+def test_static_transforms_have_no_rate(sample, tmp_path):
+    twice = rewrite(sample, tmp_path / "log.mcap", extra=lambda writer, channels: (
+        writer.add_message(channels["/tf_static"], START + 1, mcap_rows(sample)[0][-1], START + 1)
+    ))  # fmt: skip
+    (static,) = (topic for topic in inventory_of(twice)["topics"] if topic["topic"] == "/tf_static")
+    assert (static["messages"], static["hz"], static["largest_gap_s"]) == (2, None, None)
 
 
 def test_calibration_transforms_and_pairs_are_reported(description):
