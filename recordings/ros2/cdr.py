@@ -40,6 +40,7 @@ geometry_msgs/Pose pose
 
 LAST_STAMP = (1 << 31) * 1_000_000_000  # ns; the seconds of a ROS time are a signed 32 bit number
 
+FORMATS = ("ros2msg", "ros2idl")  # of a schema
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"  # no CDR message begins so
 _MAX_REASON = 100  # characters of a parser's message, which may contain the whole schema
 _SEPARATOR = re.compile(r"^={20,}\s*$", re.MULTILINE)
@@ -82,14 +83,18 @@ def full_name(schema_name: str) -> str:
 def decoder_for(schema_name: str, schema_encoding: str, text: bytes) -> Callable[[bytes | memoryview], Any]:
     """Build a function from CDR bytes to a message by the schema of a log ("ros2msg" or "ros2idl").
 
-    An empty schema means the standard type of that name, or a type without fields. Raises LogError for a schema that
-    cannot be parsed. The returned function raises the codec's exceptions for bytes that do not fit.
+    An empty schema means the standard type of that name, or a type without fields; if its encoding is empty as well, a
+    standard type. Raises LogError for a schema that cannot be parsed. The returned function raises the codec's
+    exceptions for bytes that do not fit.
     """
     name = full_name(schema_name)
-    if schema_encoding not in ("ros2msg", "ros2idl"):
-        raise LogError(f"schema '{schema_name}' is in '{schema_encoding}', not a ROS 2 format (ros2msg, ros2idl)")
-    if not text.strip() and name in standard_types().types:
+    undefined = not text.strip()
+    if undefined and schema_encoding in ("", *FORMATS) and name in standard_types().types:
         return lambda data: standard_types().deserialize_cdr(plain(data), name)
+    if undefined and not schema_encoding:
+        raise LogError(f"schema '{schema_name}' has no definition, and is no standard type of ROS 2")
+    if schema_encoding not in FORMATS:
+        raise LogError(f"schema '{schema_name}' is in '{schema_encoding}', not a ROS 2 format ({', '.join(FORMATS)})")
     store = store_of(schema_name, schema_encoding, text)
     return lambda data: store.deserialize_cdr(plain(data), name)
 

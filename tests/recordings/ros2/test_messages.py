@@ -289,6 +289,11 @@ def test_an_empty_schema_means_a_type_without_fields():
         decoder(b"\0\1\0\0" + bytes(12))  # the unknown fields
 
 
+def test_a_type_without_a_definition_that_is_no_standard_type_is_named():
+    with pytest.raises(LogError, match="schema 'vendor_msgs/msg/Arm' has no definition, and is no standard type"):
+        decoder_for("vendor_msgs/msg/Arm", "", b"")
+
+
 @settings(max_examples=30)
 @given(st.binary(max_size=80))
 def test_an_invalid_schema_is_a_log_error(text):

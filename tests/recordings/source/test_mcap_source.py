@@ -12,7 +12,7 @@ from recordings.errors import LogError
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AngleField
 from stages.data import CameraImage, Mount
-from tests.conftest import rewrite
+from tests.conftest import mcap_rows, rewrite, write_mcap
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -252,3 +252,8 @@ def test_channels_in_other_encodings_are_ignored(whole, tmp_path):
                 writer.add_message(number, time, b"\xff\xfe", time)
 
     assert essences(items_of(with_extra(tmp_path / "mixed.mcap", odd))) == essences(whole)
+
+
+def test_channels_whose_schema_has_no_format_and_no_text_have_the_standard_types(sample, whole, tmp_path):
+    rows = [(topic, encoding, (name, "", b""), *rest) for topic, encoding, (name, *_), *rest in mcap_rows(sample)]
+    assert essences(items_of(write_mcap(tmp_path / "log.mcap", rows))) == essences(whole)
