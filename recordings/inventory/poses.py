@@ -17,7 +17,7 @@ from recordings.source.topics import attempt
 from stages.data import Pose
 
 MAX_READ = 20_000  # poses of a log; of more, a sample is read
-SAMPLE_PLACES, SAMPLE_SIZE = 8, 50  # parts of a log, and messages of each
+SAMPLE_PLACES, SAMPLE_SIZE = 8, 10  # parts of a log, and messages of each; a part is read with its images
 
 Item = tuple[int, Any]  # log time, ns, and a pose or an exception
 
