@@ -75,14 +75,12 @@ def names(folder):
     return sorted(path.name for path in Path(folder).iterdir())
 
 
-def test_an_interrupted_run_goes_on_to_the_outputs_of_a_whole_one(log, whole, tmp_path):
-    out, stopped = run(log, tmp_path, draw=True, on_frame=after(STOP_AFTER, interrupt))
-    assert stopped["interrupted"]
-    assert names(tmp_path) == ["nav.mcap", "nav.mcap.checkpoint", "nav.rrd"]
-    out, summary = run(log, tmp_path, draw=True)
+def test_an_interrupted_run_goes_on_to_the_outputs_of_a_whole_one(log, whole, stopped):
+    assert names(stopped) == ["nav.mcap", "nav.mcap.checkpoint", "nav.rrd"]
+    out, summary = run(log, stopped, draw=True)
     assert (summary["verdict"], summary["frames_through"]) == ("COMPLETE", FRAMES)
     assert STOP_AFTER - 1 <= summary["frames_resumed"] < FRAMES
-    assert names(tmp_path) == ["nav.mcap", "nav.rrd"]
+    assert names(stopped) == ["nav.mcap", "nav.rrd"]
     assert out.read_bytes() == whole.read_bytes()
     assert drawn(out.with_suffix(".rrd")).keys() >= drawn(whole.with_suffix(".rrd")).keys()
 
@@ -111,11 +109,20 @@ def test_a_run_without_a_checkpoint_begins_with_the_first_frame(log, whole, tmp_
     assert out.read_bytes() == whole.read_bytes()
 
 
-@pytest.fixture
-def stopped(log, tmp_path):
+@pytest.fixture(scope="module")
+def interrupted(log, tmp_path_factory):
     """The folder of an interrupted run."""
-    run(log, tmp_path, draw=True, on_frame=after(STOP_AFTER, interrupt))
-    return tmp_path
+    folder = tmp_path_factory.mktemp("interrupted")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(checkpoint_file, "INTERVAL", 0.0)
+        run(log, folder, draw=True, on_frame=after(STOP_AFTER, interrupt))
+    return folder
+
+
+@pytest.fixture
+def stopped(interrupted, tmp_path):
+    """A copy of it."""
+    return shutil.copytree(interrupted, tmp_path / "stopped")
 
 
 @pytest.mark.parametrize(
