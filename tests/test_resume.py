@@ -85,6 +85,16 @@ def test_an_interrupted_run_goes_on_to_the_outputs_of_a_whole_one(log, whole, st
     assert drawn(out.with_suffix(".rrd")).keys() >= drawn(whole.with_suffix(".rrd")).keys()
 
 
+def test_a_run_that_is_stopped_again_before_its_first_checkpoint_goes_on(log, whole, stopped, monkeypatch):
+    monkeypatch.setattr(checkpoint_file, "INTERVAL", 1e9)
+    for _ in range(2):
+        _, summary = run(log, stopped, draw=True, on_frame=after(STOP_AFTER, interrupt))
+        assert (summary["interrupted"], names(stopped)) == (True, ["nav.mcap", "nav.mcap.checkpoint", "nav.rrd"])
+    out, summary = run(log, stopped, draw=True)
+    assert out.read_bytes() == whole.read_bytes()
+    assert drawn(out.with_suffix(".rrd")).keys() >= drawn(whole.with_suffix(".rrd")).keys()
+
+
 @pytest.mark.parametrize("options", [{"with_inputs": True}, {"profile": "foxglove", "draw": True}])
 def test_a_killed_run_goes_on_to_the_outputs_of_a_whole_one(log, tmp_path, options):
     def kill():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import resource
 import sys
 import time
@@ -62,6 +63,10 @@ class _Outputs:
                 self.discard()
                 return False
         return True
+
+    def saved(self) -> dict[str, bytes]:
+        """What the sinks have written, for a checkpoint."""
+        return {use: pickle.dumps(cast(Any, sink).checkpoint()) for use, (sink, _) in self.sinks.items()}
 
     def discard(self, only_empty: bool = False) -> None:
         """Discard what is open, so that an existing file stays. A sink without `discard` is closed later instead.
@@ -182,6 +187,8 @@ def run(
         facts = {**given, "surveys": surveys, "fixed": fixed}
         if not stop.finishing() and sinks.open(graph.frame_streams, facts, resumed):
             started = time.perf_counter() - wall
+            if checkpoints is not None and resumed is not None:  # of the outputs that the run writes from now on
+                checkpoints.keep(replace(resumed, states={**resumed.states, **sinks.saved()}))
             events = _read(log.events(assembler.wanted), stop)
             at_end = _feed(assembler.frames(events), assembler, engine, stop, Pace(rate), checkpoints)
     finally:
