@@ -18,6 +18,7 @@ import numpy as np
 
 from flow.contracts import counted
 from stages.data import Array, CameraMotion, Mount, Pose, Transform
+from stages.localisation.pose_jumps import PoseJumps
 
 MIN_STEPS = 5
 MIN_STEP = 0.02  # m; shorter steps are mostly noise
@@ -50,6 +51,7 @@ class PoseCheck:
     begin: _Cameras | None = None  # of the stretch
     steps: list[Array] = field(default_factory=list)  # (3,) each, m: by the images, by the pose, their difference
     stretches: list[Array] = field(default_factory=list)  # (5,) each: the same, then turns by the images, by the pose
+    jumps: PoseJumps = field(default_factory=PoseJumps)
 
     def add(self, motion: CameraMotion, pose: Pose, mount: Mount, up: Array) -> None:
         """Add a frame. up: (3,) in the camera."""
@@ -58,6 +60,7 @@ class PoseCheck:
             self.last = self.begin = None
             return
         now = _Cameras(motion.segment, pose.frame_id, motion.camera, pose.transform.after(camera))
+        self.jumps.add(motion, pose, now.logged)
         if self.last is not None and self.last[:2] == now[:2]:
             self.steps.append(_lengths(self.last, now))
         if self.begin is None or self.begin[:2] != now[:2]:
@@ -84,11 +87,23 @@ class PoseCheck:
                 f"{np.median(visual):.2f} m, difference {usual:.2f} m ({len(difference)} steps). Check its frame, its "
                 "heading and its unit, or set source.odometry to visual: visual odometry then supplies the pose."
             )
-        jumps = difference[(difference > MIN_JUMP) & (difference > MIN_JUMP_RATIO * usual)]
-        if len(jumps):
-            times = counted(len(jumps), "time")
-            return f"Logged odometry jumps {times} relative to visual odometry, by up to {jumps.max():.1f} m."
-        return self._wrong_stretches()
+        large = difference[(difference > MIN_JUMP) & (difference > MIN_JUMP_RATIO * usual)]
+        if len(large):
+            return self._jump_problem(large)
+        return self._wrong_stretches() or self._jump_problem(large)
+
+    def _jump_problem(self, large: Array) -> str:
+        """The steps that jump, in a sentence; empty if none does. large: m, those that do whatever the others are."""
+        sizes = [move.difference for move in self.jumps.contradicted()]
+        sizes = [*large, *(size for size in sizes if not np.isclose(size, large).any())]
+        if not sizes:
+            return ""
+        at = next((move.end for move in self.jumps.moves if np.isclose(move.difference, sizes).any()), None)
+        first = "" if at is None else f", first at the frame {self.jumps.seconds(at):.1f} s after the first one"
+        size = f"{max(sizes):.{1 if max(sizes) >= 1 else 2}f} m"
+        return (
+            f"Logged odometry jumps {counted(len(sizes), 'time')} relative to visual odometry, by up to {size}{first}."
+        )
 
     def _wrong_stretches(self) -> str:
         """What is wrong with parts of the drive."""
