@@ -17,6 +17,7 @@ from stages.data import Array, CameraMotion, Mount, Pose, Tilt, Transform
 from stages.data.covariance import translated_covariance
 from stages.data.rotations import canonical, quaternion_of, turn_by
 from stages.localisation.pose_check import PoseCheck
+from stages.localisation.pose_gaps import gap_problem
 from stages.stage import Stage, check_types, parameter
 
 VISUAL_FRAME = "visual_odom"  # "visual_odom/2" after tracking was lost once
@@ -110,7 +111,10 @@ class PoseFilter(Stage):
 
     def finding(self, state: PoseMemory) -> Finding | None:
         """The source of the poses if it is not the log; a warning if tracking was lost or the log's poses are wrong."""
-        if problem := state.check.problem():
+        problem = state.check.problem()
+        if unseen := gap_problem(state.check.jumps):
+            return Finding(" ".join(filter(None, (unseen, problem))), Severity.WARNING)
+        if problem:
             return Finding(problem, Severity.WARNING, assumes="tilt")  # both use the mount of the camera
         losses = counted(state.segment - 1, "time")
         if state.estimate is None:

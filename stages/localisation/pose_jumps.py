@@ -26,6 +26,7 @@ class _Frame(NamedTuple):
     stamp: int
     visual: Transform  # the camera
     logged: Transform  # the camera
+    pose: Transform
     covariance: Array  # of visual
 
 
@@ -38,11 +39,19 @@ class Move(NamedTuple):
     logged: Array  # (3,) m
     sigma: float  # m, of visual
     inliers: int
+    shift: Array  # (3,) m, of the pose in its own axes before
+    arrival: Array  # (3,) m, the same in its own axes after
+    place: Array  # (3,) m, after
 
     @property
     def seconds(self) -> float:
         """Its time, s."""
         return (self.end - self.start) / 1e9
+
+    @property
+    def speed(self) -> float:
+        """Of the pose, m/s."""
+        return float(np.linalg.norm(self.shift)) / self.seconds
 
     @property
     def difference(self) -> float:
@@ -61,16 +70,16 @@ class PoseJumps:
 
     last: _Frame | None = None
     moves: list[Move] = field(default_factory=list)
-    first: int = 0  # stamp of the first frame
+    first: tuple[int, Array] = (0, np.zeros(3))  # stamp and place of the first frame
 
     def add(self, motion: CameraMotion, pose: Pose, logged: Transform) -> None:
         """Add a frame that has a visual pose. logged: the camera by the log's pose."""
         assert motion.camera is not None
         track = motion.segment, pose.frame_id
-        now = _Frame(track, motion.stamp, motion.camera, logged, motion.covariance)
+        now = _Frame(track, motion.stamp, motion.camera, logged, pose.transform, motion.covariance)
         last, self.last = self.last, now
         if last is None:
-            self.first = now.stamp
+            self.first = now.stamp, pose.position
         elif last.track[1] == pose.frame_id and now.stamp > last.stamp:
             self.moves.append(_move(last, now, motion.inliers))
 
@@ -87,19 +96,22 @@ class PoseJumps:
 
     def seconds(self, stamp: int) -> float:
         """The time of a frame after the first frame, s."""
-        return (stamp - self.first) / 1e9
+        return (stamp - self.first[0]) / 1e9
 
 
 def _move(before: _Frame, after: _Frame, inliers: int) -> Move:
     """The motion between two frames."""
-    visual, logged = (
+    visual, logged, shift = (
         one.rotation.T @ (other.translation - one.translation)
-        for one, other in zip(before[2:4], after[2:4], strict=True)
+        for one, other in zip(before[2:5], after[2:5], strict=True)
     )
+    arrival = after.pose.rotation.T @ (after.pose.translation - before.pose.translation)
     gained = np.trace((after.covariance - before.covariance)[:3, :3])
     tracked = before.track == after.track
-    sigma = float(np.sqrt(max(gained, 0.0)))
-    return Move(before.stamp, after.stamp, visual if tracked else None, logged, sigma, inliers)
+    return Move(
+        before.stamp, after.stamp, visual if tracked else None, logged, float(np.sqrt(max(gained, 0.0))), inliers,
+        shift, arrival, after.pose.translation,
+    )  # fmt: skip
 
 
 def _contradicted(move: Move, near: list[Move]) -> bool:

@@ -1,15 +1,18 @@
 """A logged pose that jumps is a warning: in one step that the images contradict, or where no image confirms it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stages import CameraMotion, Mount, Pose, Transform
+from flow.contracts import Severity
+from stages import CameraMotion, Mount, Pose, PoseFilter, Tilt, Transform
 from stages.data import Array
 from stages.localisation.pose_check import PoseCheck
+from stages.localisation.pose_gaps import gap_problem
+from tests.stages.running import Running
 
 SECOND = 1_000_000_000
 MOUNT = Mount(0, np.eye(3))
@@ -100,3 +103,68 @@ def test_sound_and_noisy_odometry_does_not_jump(cameras, poses):
     motions = [motion_of(camera, number) for number, camera in enumerate(cameras)]
     check = checked(motions, poses(cameras))
     assert check.jumps.contradicted() == []
+
+
+def parts(gap: float, place: Callable[[Transform], Array], cameras: Sequence[Transform] = DRIVE, segment: int = 2):
+    """Two drives in one log, `gap` seconds apart; the second has its poses at `place` of its cameras."""
+    first = [(motion_of(camera, number), pose_at(camera)) for number, camera in enumerate(cameras)]
+    later = [len(cameras) / 2 - 0.5 + gap + number / 2 for number in range(len(cameras))]
+    second = [
+        (motion_of(camera, number, seconds, segment), pose_at(camera, place(camera)))
+        for number, (camera, seconds) in enumerate(zip(cameras, later, strict=True))
+    ]
+    return zip(*first, *second, strict=True)
+
+
+BACK, ASIDE = np.zeros(3), np.array([4.0, 2.0, 0.0])  # of the second drive; the first one ends at (5, 0)
+
+
+@pytest.mark.parametrize(("gap", "start", "why"), [
+    (3600, BACK, "moves by 5.0 m between 10.0 s and 3610.0 s after the first frame, back to where it began."),
+    (12, BACK, "moves by 5.0 m between 10.0 s and 22.0 s after the first frame, back to where it began."),
+    (12, ASIDE, "moves by 2.2 m between 10.0 s and 22.0 s after the first frame, against the direction of the drive"),
+    (0.5, ASIDE, "between 10.0 s and 10.5 s after the first frame, at 4.5 m/s, though it drives at most 0.5 m/s"),
+])  # fmt: skip
+def test_odometry_that_starts_again_is_a_warning_with_its_time_and_size(gap, start, why):
+    check = checked(*parts(gap, lambda camera: camera.translation + start))
+    assert why in gap_problem(check.jumps)
+    assert "run each part of the log alone with --start and --end" in gap_problem(check.jumps)
+
+
+STOP_AND_GO = track(([0.0] * 5 + [STEP] + [0.0] * 4) * 2)
+
+
+@pytest.mark.parametrize(("gap", "start", "cameras", "segment"), [
+    (12, [10.5, 1, 0], DRIVE, 2),  # it drives on
+    (12, [7.0, 0, 0], DRIVE, 2),  # it stops and drives on
+    (3600, [5.2, 0.1, 0], DRIVE, 2),  # it stands
+    (1.0, [5.5, 0, 0], DRIVE, 2),  # a lost frame
+    (12, [-10, 0, 0], track([-STEP] * 20), 2),  # it drives on backwards
+    (20, [6, 1, 0], STOP_AND_GO, 2),  # images only where it stands
+    (12, [5, 4, 0], track([STEP] * 20, [0.0] * 19 + [60.0]), 2),  # in a curve
+])  # fmt: skip
+def test_a_drive_that_goes_on_without_images_is_no_warning(gap, start, cameras, segment):
+    given = parts(gap, lambda camera: camera.translation + start, cameras, segment)
+    assert gap_problem(checked(*given).jumps) == ""
+
+
+def test_a_track_across_the_gap_confirms_the_pose():
+    cameras = [replace(camera, translation=camera.translation + BACK) for camera in DRIVE]
+    given = list(zip(*parts(12, lambda camera: camera.translation, cameras, segment=1), strict=True))
+    assert gap_problem(checked(*zip(*given, strict=True)).jumps) == ""
+
+
+def test_nothing_is_known_of_a_log_without_any_track():
+    motions = [motion_of(camera, 0, 2.0 * number**3, number + 1) for number, camera in enumerate(DRIVE)]
+    assert gap_problem(checked(motions, moved(DRIVE, 9.0)).jumps) == ""
+
+
+def test_both_jumps_are_one_warning_of_the_run():
+    motions, poses = parts(12, lambda camera: camera.translation + np.array([0, 0.3 * (camera.translation[0] > 1), 0]))
+    stage = Running(PoseFilter())
+    for motion, pose in zip(motions, poses, strict=True):
+        stage(motion, Tilt(motion.stamp, UP), MOUNT, pose)
+    found = stage.finding()
+    assert found.severity == Severity.WARNING
+    assert "back to where it began" in found.sentence
+    assert "jumps 1 time relative to visual odometry, by up to 0.30 m" in found.sentence
