@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from recordings.source.transforms import TransformTree
 from stages.data import Array, Mount, Pose
 from stages.data.rotations import matrix_of
 
+ODOMETRY_FRAME = "odom"  # of poses whose frame has no name
 STATIC_STAMP = 0  # ns; a mount holds for the whole log, whose frames may have stamps of another clock
 
 
@@ -36,8 +38,10 @@ def mount_of(
 def pose_of_base(pose: Pose, camera: Camera, base: str, tree: TransformTree) -> Pose:
     """The pose of the frame `base`, or of the camera's rectified image where nothing joins the camera and `base`.
 
-    A pose of a frame that no static transform joins to them is returned as it is.
+    A pose of a frame that no static transform joins to them is returned as it is. A frame without a name becomes
+    `odom`, because no transform can have it.
     """
+    pose = pose if pose.frame_id else replace(pose, frame_id=ODOMETRY_FRAME)
     of = pose.child_frame_id
     if of in (base, camera.image_frame):
         return pose

@@ -19,7 +19,7 @@ from recordings.ros2.from_msg import frame_name, frame_of, pose_of, transform_of
 from recordings.source.calibration import Camera, baseline_fault, baseline_note, calibrated_pair
 from recordings.source.cameras import CAMERAS, first_calibrations, in_known_frames, mismatched_images
 from recordings.source.joints import read_joints
-from recordings.source.mount import mount_of, pose_of_base
+from recordings.source.mount import ODOMETRY_FRAME, mount_of, pose_of_base
 from recordings.source.moving_mount import MovingMount, moving_mount
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
@@ -136,6 +136,9 @@ class SourceResolution:
         notes += [(side, finding.sentence) for side, finding in self.findings if side in self.topics]
         if self.source.odometry == VISUAL:
             notes.append(("odometry", self.unavailable["odometry"]))
+        if self._is_pose_unnamed and "odometry" in self.topics:
+            unnamed = f"the frame_id of {self.topics['odometry']} is empty; its poses are read as in '{ODOMETRY_FRAME}'"
+            notes.append(("odometry", unnamed))
         if self.tilt is not None:
             notes.append(("inclinometer", self.tilt.note(estimator, self.source)))
         if self.mount is not None and self.mount.base_from_camera is None:
@@ -262,14 +265,16 @@ class SourceResolution:
 
     def _resolve_pose(self) -> None:
         """Whether the poses can be used: in a fixed frame, of a frame that is joined to the camera."""
+        self._is_pose_unnamed = False
         if self.cameras is None or "odometry" not in self.chosen:
             return
         topic, camera, image = self.chosen["odometry"], self.cameras[0].frame_id, self.cameras[0].image_frame
         pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
         if isinstance(pose, LogError):
             return
-        of, fixed = pose.child_frame_id, pose.frame_id
-        moving = pose_of_base(pose, self.cameras[0], self.source.base_frame, self.static).child_frame_id
+        self._is_pose_unnamed, of = not pose.frame_id, pose.child_frame_id
+        placed = pose_of_base(pose, self.cameras[0], self.source.base_frame, self.static)
+        fixed, moving = placed.frame_id, placed.child_frame_id
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
         if fixed in (LEVEL_FRAME, image, of, moving) or self.static.between(fixed, camera) is not None:
             why = f"{topic} is a pose in the frame '{fixed}', which moves with the rover; record it in a fixed frame"

@@ -202,6 +202,15 @@ def test_a_pose_in_a_frame_of_the_rover_is_refused(tmp_path, problems, resting):
     assert f"a pose in the frame '{resting}', which moves with the rover" in missing_in(log)["odometry"]
 
 
+def test_poses_in_a_frame_without_a_name_are_in_odom_and_noted(sample, tmp_path):
+    log = write_sample(tmp_path / "log.mcap", changed("/odom", {"header.frame_id": ""}))
+    with McapSource().open(log) as opened:
+        assert {item.frame_id for _, _, item in opened.events(["odometry"])} == {"odom"}
+        assert opened.notes()["odometry"] == "the frame_id of /odom is empty; its poses are read as in 'odom'"
+    with McapSource().open(sample) as opened:
+        assert "odometry" not in opened.notes()
+
+
 def test_frames_without_names_are_not_connected(tmp_path):
     edits = dropped("/tf_static"), changed("", {"header.frame_id": ""})
     assert TransformTree().between("", "") is None
