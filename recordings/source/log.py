@@ -22,6 +22,7 @@ from recordings.containers.clock import MAX_JITTER_NS
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.containers.opening import open_recording
 from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInRange, TimeRange
+from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
 from recordings.source.cameras import CAMERAS, CalibrationHistory
@@ -230,10 +231,24 @@ class McapLog(AbstractContextManager["McapLog"]):
         notes = [(stream, UNSTAMPED) for stream, topic in self.topics.items() if messages.is_unstamped(topic)]
         if any(self._schema(side) == VIDEO for side in CAMERAS):
             notes.append(("left", VIDEO_NOTE))
-        notes += self.resolution.notes(self._estimator)
+        notes += [*self.resolution.notes(self._estimator), ("odometry", self._clock_of_poses())]
         notes += [("left", note) for note in self.file.notes if "left" in self.topics]
         noted = dict.fromkeys(stream for stream, note in notes if note)
         return {stream: "; ".join(note for of, note in notes if of == stream and note) for stream in noted}
+
+    def _clock_of_poses(self) -> str:
+        """A note if the poses' stamps are of another clock than the images', with the setting; else empty."""
+        if not {"left", "odometry"} <= self.topics.keys() or self._schema("odometry") == TRANSFORMS:
+            return ""  # the stamps of transforms are not in a header
+        left, poses = (self.resolution.messages.ahead_of(self.topics[stream]) for stream in ("left", "odometry"))
+        differ = abs(poses + self.time_offset("odometry") - left)
+        if differ <= self.file.end - self.file.start:
+            return ""
+        setting = f"--set source.time_offset.odometry={(left - poses) / 1e9:.3f}s"
+        return (
+            f"the stamps of poses and images are of clocks that differ by {differ / 1e9:.1f} s; record both with one; "
+            f"{setting} corrects the poses, if both are logged equally soon"
+        )
 
     def faults(self) -> dict[str, Finding]:
         """Stream -> what is wrong with it, by what the log states or by what a run has shown."""

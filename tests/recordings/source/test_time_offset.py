@@ -102,3 +102,15 @@ def test_info_names_the_offset_of_another_clock(tmp_path, seconds):
         with McapSource(time_offset=TimeOffsets(inclinometer=given * 1_000_000_000)).open(path) as log:
             text = format_description(describe(log, max_gap_of=lambda intervals: 2 * PERIOD))
         assert (setting in text) == (given != -seconds)
+
+
+@pytest.mark.parametrize("seconds", [100, -37])
+def test_a_log_notes_the_offset_of_poses_of_another_clock(sample, tmp_path, seconds):
+    path = write_sample(tmp_path / "log.mcap", changed("/odom", {"header.stamp.sec": lambda stamp: stamp + seconds}))
+    for given, named in ((0, True), (-seconds + 5, True), (-seconds, False)):
+        with McapSource(time_offset=TimeOffsets(odometry=given * 1_000_000_000)).open(path) as log:
+            note = log.notes().get("odometry", "")
+        assert (f"--set source.time_offset.odometry={-seconds}.000s corrects the poses" in note) == named
+        assert (f"clocks that differ by {abs(seconds + given):.1f} s" in note) == named
+    with McapSource().open(sample) as log:
+        assert "odometry" not in log.notes()
