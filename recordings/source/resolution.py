@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,9 @@ from stages.data import LEVEL_FRAME, Mount, Pose, StereoCamera
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
 _MAX_LISTED = 5  # topics in a sentence
+_MIN_APART = 0.1  # m, between the poses of two publishers, and
+_MIN_ALTERNATION = 2.0  # times the way from one pose to the next but one; noise reaches 1
+_MIN_POSES = 20
 
 
 class SourceResolution:
@@ -139,6 +142,9 @@ class SourceResolution:
         if self._is_pose_unnamed and "odometry" in self.topics:
             unnamed = f"the frame_id of {self.topics['odometry']} is empty; its poses are read as in '{ODOMETRY_FRAME}'"
             notes.append(("odometry", unnamed))
+        if self._poses_apart and "odometry" in self.topics:
+            apart = f"{self.topics['odometry']} alternate between places {self._poses_apart:.2f} m apart"
+            notes.append(("odometry", f"poses on {apart}, as of two publishers, and are mixed; record one of them"))
         if self.tilt is not None:
             notes.append(("inclinometer", self.tilt.note(estimator, self.source)))
         if self.mount is not None and self.mount.base_from_camera is None:
@@ -265,7 +271,7 @@ class SourceResolution:
 
     def _resolve_pose(self) -> None:
         """Whether the poses can be used: in a fixed frame, of a frame that is joined to the camera."""
-        self._is_pose_unnamed = False
+        self._is_pose_unnamed, self._poses_apart = False, 0.0
         if self.cameras is None or "odometry" not in self.chosen:
             return
         topic, camera, image = self.chosen["odometry"], self.cameras[0].frame_id, self.cameras[0].image_frame
@@ -273,6 +279,7 @@ class SourceResolution:
         if isinstance(pose, LogError):
             return
         self._is_pose_unnamed, of = not pose.frame_id, pose.child_frame_id
+        self._poses_apart = _apart(self.messages.sample(topic, lambda each: _timed_place(each, self.source.base_frame)))
         placed = pose_of_base(pose, self.cameras[0], self.source.base_frame, self.static)
         fixed, moving = placed.frame_id, placed.child_frame_id
         base = self.mount.base_from_camera if self.mount is not None else self.static.between(moving, camera)
@@ -316,3 +323,21 @@ def _pose_of(message: Any, base_frame: str) -> Pose:
     if pose is None:
         raise LogError(f"it contains no pose of '{base_frame}'")
     return pose
+
+
+def _timed_place(message: Any, base_frame: str) -> tuple[float, float, float, float]:
+    """Stamp, ns, and position, m, of a pose."""
+    pose = _pose_of(message, base_frame)
+    x, y, z = pose.position
+    return pose.stamp, x, y, z
+
+
+def _apart(sampled: Iterable[tuple[float, float, float, float] | LogError]) -> float:
+    """How far apart, m, the poses of two publishers are that alternate; 0 for those of one."""
+    places = {stamp: place for stamp, *place in (each for each in sampled if not isinstance(each, LogError))}
+    if len(places) < _MIN_POSES:
+        return 0.0
+    at = np.array([places[stamp] for stamp in sorted(places)])
+    apart = float(np.median(np.linalg.norm(at[1:-1] - (at[:-2] + at[2:]) / 2, axis=1)))
+    moved = float(np.median(np.linalg.norm(at[2:] - at[:-2], axis=1)))
+    return apart if apart > max(_MIN_APART, _MIN_ALTERNATION * moved) else 0.0

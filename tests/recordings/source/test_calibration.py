@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 from flow.contracts import Finding, Severity
 from recordings import McapSource
 from recordings.errors import LogError
-from recordings.ros2.to_msg import transform_message
+from recordings.ros2.to_msg import odometry, transform_message
 from recordings.source.calibration import calibrated_pair
 from recordings.source.transforms import BODY_FROM_OPTICAL, TransformTree
-from stages.data import CameraModel, Transform
+from stages.data import CameraModel, Pose, Transform
+from tests.conftest import write_messages
 from tests.recordings.sample_log import (
     BASELINE,
     FRAMES,
@@ -209,6 +210,22 @@ def test_poses_in_a_frame_without_a_name_are_in_odom_and_noted(sample, tmp_path)
         assert opened.notes()["odometry"] == "the frame_id of /odom is empty; its poses are read as in 'odom'"
     with McapSource().open(sample) as opened:
         assert "odometry" not in opened.notes()
+
+
+@pytest.mark.parametrize(("apart", "sigma", "noted"), [(0.5, 0.0, True), (0.0, 0.3, False), (0.05, 0.0, False)])
+def test_two_publishers_of_the_pose_that_contradict_each_other_are_noted(tmp_path, apart, sigma, noted):
+    images = write_sample(tmp_path / "images.mcap", dropped("/odom"))
+    shifts = np.random.default_rng(0).normal(0, sigma, (60, 3)) + [[0, apart * (at % 2), 0] for at in range(60)]
+    stamps = [START + at * 7_000_000 for at in range(60)]
+    poses = [
+        Pose(stamp, shift + np.array([0.005 * at, 0, 0]), [0, 0, 0, 1], "odom", "base_link")
+        for at, (stamp, shift) in enumerate(zip(stamps, shifts, strict=True))
+    ]
+    rows = [(pose.stamp, "/odom", odometry(pose)) for pose in poses]
+    with McapSource().open([images, write_messages(tmp_path / "poses.mcap", rows)]) as log:
+        note = log.notes().get("odometry", "")
+    assert ("alternate between places 0.50 m apart, as of two publishers" in note) == noted
+    assert bool(note) == noted
 
 
 def test_frames_without_names_are_not_connected(tmp_path):
