@@ -182,6 +182,14 @@ def test_a_foreign_file_is_no_checkpoint(log, tmp_path, said):
     assert foreign.exists()
 
 
+def test_a_checkpoint_that_is_cut_is_refused(log, stopped, said):
+    checkpoint = stopped / "nav.mcap.checkpoint"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:100])
+    error = said(2, "run", log, "-p", "fast", "-o", stopped / "nav.mcap", "--resume").err
+    assert error.startswith(f"roverflow: cannot read the checkpoint {checkpoint}: ")
+    assert error.endswith("; run without --resume to begin with the first frame\n")
+
+
 def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_run(log, tmp_path, monkeypatch, capsys):
     (tmp_path / "nav.mcap.checkpoint").mkdir()
     monkeypatch.setattr(checkpoint_file.CheckpointFile, "_read", lambda file: None)

@@ -14,6 +14,7 @@ from recordings.atomic_write import give_name, temporary_name, writing
 from recordings.errors import UnwritableError
 
 INTERVAL = 10.0  # s, between checkpoints
+_REMEDY = "run without --resume to begin with the first frame"
 _MAGIC = b"roverflow checkpoint\n"
 _NAMES = {  # of facts, in words
     "pipeline": "the pipeline file", "overrides": "--set", "log": "the log's name", "log_digest": "the log",
@@ -61,12 +62,14 @@ class CheckpointFile:
         content = self.path.read_bytes()
         if not content.startswith(_MAGIC):
             raise UsageError(f"{self.path} is not a checkpoint; remove it, or choose another name for the result log")
-        facts, checkpoint = pickle.loads(content[len(_MAGIC) :])
+        try:
+            facts, checkpoint = pickle.loads(content[len(_MAGIC) :])
+        except Exception as error:  # a cut file, or one of another version, may fail in any way
+            raise UsageError(f"cannot read the checkpoint {self.path}: {error}; {_REMEDY}") from error
         changed = [name for name in facts.keys() | self._facts.keys() if facts.get(name) != self._facts.get(name)]
         if changed:
             differing = " and ".join(sorted(_NAMES.get(name, f"the version of {name}") for name in changed))
-            remedy = "run without --resume to begin with the first frame"
-            raise UsageError(f"{differing} changed since the run that {self.path} continues; {remedy}")
+            raise UsageError(f"{differing} changed since the run that {self.path} continues; {_REMEDY}")
         assert isinstance(checkpoint, Checkpoint)
         return checkpoint
 
