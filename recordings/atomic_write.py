@@ -8,14 +8,12 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from itertools import count
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
+from secrets import token_hex
 from shutil import disk_usage
 
 from recordings.errors import UnwritableError
-
-_numbers = count()
 
 
 def temporary_name(path: Path, mark: str = "") -> Path:
@@ -25,7 +23,7 @@ def temporary_name(path: Path, mark: str = "") -> Path:
         raise UnwritableError(f"cannot write {path}: it is a folder; give a file name")
     if path.exists() and not path.is_file():
         raise UnwritableError(f"cannot write {path}: it is not a regular file; give a file name")
-    return path.with_name(f"{path.name}.{mark or f'{os.getpid()}-{next(_numbers)}'}.partial")
+    return path.with_name(f"{path.name}.{mark or f'{os.getpid()}-{token_hex(4)}'}.partial")
 
 
 def check_writable(path: Path) -> None:

@@ -12,7 +12,9 @@ import rerun as rr
 
 from flow.cli import checkpoint_file
 from flow.cli.replay import replay
-from flow.errors import SinkError
+from flow.config.templates import SHIPPED
+from flow.errors import SinkError, UsageError
+from recordings.errors import UnwritableError
 from recordings.simulator import Simulation, write_log
 
 FRAMES, STOP_AFTER = 7, 2
@@ -36,6 +38,7 @@ def whole(log, tmp_path_factory):
 @pytest.fixture(autouse=True)
 def _checkpoint_after_each_frame(monkeypatch):
     monkeypatch.setattr(checkpoint_file, "INTERVAL", 0.0)
+    monkeypatch.setattr(checkpoint_file, "MAX_SHARE", 1e9)
 
 
 def run(log, folder, resume=True, draw=False, **options):
@@ -125,6 +128,7 @@ def interrupted(log, tmp_path_factory):
     folder = tmp_path_factory.mktemp("interrupted")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(checkpoint_file, "INTERVAL", 0.0)
+        patch.setattr(checkpoint_file, "MAX_SHARE", 1e9)
         run(log, folder, draw=True, on_frame=after(STOP_AFTER, interrupt))
     return folder
 
@@ -178,7 +182,7 @@ def test_a_foreign_file_is_no_checkpoint(log, tmp_path, said):
     assert error == (
         f"roverflow: {foreign} is not a checkpoint; remove it, or choose another name for the result log\n"
     )
-    checkpoint_file.remove_checkpoint(tmp_path / "nav.mcap")
+    checkpoint_file.remove_checkpoint([tmp_path / "nav.mcap"])
     assert foreign.exists()
 
 
@@ -196,3 +200,31 @@ def test_a_checkpoint_that_cannot_be_written_does_not_stop_the_run(log, tmp_path
     _, summary = run(log, tmp_path)
     assert summary["verdict"] == "COMPLETE"
     assert capsys.readouterr().err.count("no further checkpoints: cannot write ") == 1
+
+
+def test_two_runs_do_not_write_one_output(log, stopped):
+    with (
+        checkpoint_file.only_run_of(stopped / "nav.mcap"),
+        pytest.raises(UnwritableError, match=r"nav\.mcap is being written by another run; wait for it, or stop it"),
+    ):
+        run(log, stopped, draw=True)
+    assert run(log, stopped, draw=True)[1]["verdict"] == "COMPLETE"
+    assert names(stopped) == ["nav.mcap", "nav.rrd"]
+
+
+def test_what_a_kill_has_left_is_removed_with_the_checkpoint(log, stopped):
+    for name in ("nav.mcap.1-ab.partial", "nav.rrd.1-ab.partial"):
+        (stopped / name).touch()
+    run(log, stopped, resume=False, draw=True)
+    assert names(stopped) == ["nav.mcap", "nav.rrd"]
+
+
+def test_a_changed_module_beside_the_pipeline_is_refused(log, tmp_path):
+    pipeline, module, out = tmp_path / "own.yaml", tmp_path / "beside_resumed.py", tmp_path / "nav.mcap"
+    pipeline.write_text((SHIPPED / "fast.yaml").read_text())
+    module.write_text("VALUE = 1\n")
+    options = {"overrides": OVERRIDES, "resume": True}
+    replay(log, pipeline, out, None, on_frame=after(STOP_AFTER, interrupt), **options)
+    module.write_text("VALUE = 2\n")
+    with pytest.raises(UsageError, match="a module beside the pipeline file changed since the run that"):
+        replay(log, pipeline, out, None, **options)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from flow.contracts import Verdict
 from flow.errors import UsageError
 from flow.runtime.frame_selection import Every
 from flow.runtime.graph import Graph
@@ -57,12 +58,14 @@ def replay(
     >>> replay("traverse.mcap", "rover", "nav.mcap", None, overrides=["disparities=128"])["verdict"]  # doctest: +SKIP
     'COMPLETE'
     """
-    from flow.cli.checkpoint_file import CheckpointFile, remove_checkpoint
+    from flow.cli.checkpoint_file import CheckpointFile, checkpoint_of, only_run_of, remove_checkpoint
     from flow.config import loader as pipelines
     from flow.runtime.interrupts import Stop, interrupts
     from flow.runtime.run import run
     from stages.kernel_loading import loading_kernels
 
+    if resume and rate is not None:
+        raise UsageError("--resume is for runs as fast as possible; leave out --rate")
     every = every if every is None or isinstance(every, Every) else Every(every)
     graph = pipelines.load(pipeline, overrides)
     logs = (Path(log),) if isinstance(log, Path | str) else tuple(map(Path, log))
@@ -72,12 +75,14 @@ def replay(
     given |= {"limits": _limits(graph), "finals": _final_disparities(graph)}
     graph = replace(graph, sinks=tuple((use, _with(sink, given)) for use, sink in graph.sinks))
     outputs = _outputs(graph, {".mcap": Path(out), ".rrd": Path(rrd) if rrd is not None else None})
+    written = [Path(out), *([Path(rrd)] if rrd is not None else [])]
     stop = Stop()
     drawing = () if rrd is None else ("recordings.sinks.rerun_recording", ARROW_EXTRA)
     with (
         loading_kernels(RESULT_TYPES, *drawing),
         graph.source.open(log, start=start, end=end) as opened,
         one_thread_per_call(),
+        only_run_of(Path(out)) if resume or checkpoint_of(Path(out)).exists() else nullcontext(),
     ):
         about = _about(graph, logs, files, start, end, every)
         hidden = on_frame is not None or not sys.stderr.isatty()
@@ -85,12 +90,25 @@ def replay(
             settings: dict[str, Any] = {"workers": workers, "every": every, "rate": rate}
             if resume:
                 recording = os.path.relpath(rrd, Path(out).parent) if rrd is not None else ""
-                facts = about | {"outputs": repr((recording, profile, desk, with_inputs))}
+                chosen = repr((recording, profile, desk, with_inputs))
+                facts = about | {"outputs": chosen, "modules": _modules(pipeline)}
                 settings["checkpoints"] = CheckpointFile(Path(out), facts, say)
+            else:
+                remove_checkpoint(written)
             summary = run(graph, opened, outputs, **settings, about=about, stop=stop, on_frame=on_frame or advance)
-    if not (resume and summary["interrupted"]):
-        remove_checkpoint(Path(out))
+            if not summary["interrupted"] or summary["verdict"] == Verdict.COMPLETE:
+                remove_checkpoint(written)
     return as_json(summary | {"overrides": list(overrides)})
+
+
+def _modules(pipeline: str | Path) -> str:
+    """The digests of the modules beside a pipeline file of the user's own, which may have its stages."""
+    from flow.config.loader import pipeline_file
+    from flow.config.templates import SHIPPED
+    from recordings.containers.digest import digest_lines
+
+    folder = pipeline_file(pipeline).parent
+    return "" if folder == SHIPPED else "\n".join(digest_lines(sorted(folder.glob("*.py"))))
 
 
 def _about(

@@ -1,4 +1,4 @@
-"""Checkpoints: from the last one, a run that was stopped or killed goes on, with the results that it would have had.
+"""Checkpoints: a run that was stopped or killed resumes from its last one, with identical results.
 
 A checkpoint lies between two frames. Every stage and sink saves its state when it is through with the first of them,
 while others are still behind or already ahead. The source and the aligners save none: the log is read from its
@@ -32,7 +32,11 @@ class Checkpoint:
 
     def state(self, name: str) -> Any:
         """The state of a stage or sink. It comes from a pickle: never resume from an untrusted source."""
-        return pickle.loads(self.states[name])
+        try:
+            return pickle.loads(self.states[name])
+        except Exception as error:  # a class of the user's own may be gone
+            why = f"the state of '{name}' in the checkpoint cannot be read: {error}"
+            raise UsageError(f"{why}; run without --resume to begin with the first frame") from error
 
 
 class Checkpoints(Protocol):
@@ -45,6 +49,9 @@ class Checkpoints(Protocol):
 
     def keep(self, checkpoint: Checkpoint) -> None:
         """Keep a checkpoint in place of the one before."""
+
+    def give_up(self, why: str) -> None:
+        """Make no further checkpoints. why: a sentence."""
 
 
 def check_resumable(stages: Iterable[Node], sinks: Mapping[str, Sink]) -> None:

@@ -63,6 +63,7 @@ class Engine:
         self._frames: deque[Frame] = deque()
         self.states = start(stages) | dict(states or {})  # stream -> state of its stage, of this run
         self.states |= {name: resumed.state(name) for name in self.states} if resumed is not None else {}
+        self.unsaved = ""  # why there are no checkpoints
         self.checkpoint: Checkpoint | None = None  # the last one that every stage and sink is through
         self._work = [self._stage_work(node) for node in stages]
         self._sink_seconds = dict.fromkeys(sinks, 0.0)  # of the last frame that was through
@@ -298,9 +299,19 @@ class Engine:
         self._free(frame, work.reads if work.output is None else (*work.reads, work.output))
         for other in self._frames if work.ordered else ():
             if other.index == work.next and work in other.done:
-                if other.saved is not None:
-                    other.saved[work.name] = pickle.dumps(work.state())
+                self._save(work, other)
                 work.next += 1
+
+    def _save(self, work: Work, frame: Frame) -> None:
+        """Save the state after a frame, if a checkpoint follows it."""
+        saved = frame.saved
+        if saved is None:
+            return
+        state = work.state()
+        try:
+            saved[work.name] = pickle.dumps(state)
+        except Exception as error:
+            frame.saved, self.unsaved = None, f"the state of '{work.name}' cannot be pickled: {error}"
 
     def _free(self, frame: Frame, streams: Iterable[str]) -> None:
         """Let go of the items that no work on the frame will read any more. What marks a missing item stays."""
@@ -331,7 +342,7 @@ class Engine:
             self._sink_seconds = {name: frame.seconds[name] for name in self._sink_seconds}
             self.through += 1
             self.complete += complete
-            if frame.saved is not None:
+            if frame.saved is not None and not self.failure:
                 names = {work.name for work in self._work}
                 entries = (entry for entry in self._ledger.entries if entry.stage in names)
                 losses = tuple(entry for entry in entries if entry.stamp <= frame.stamp)

@@ -8,7 +8,7 @@ stages and sinks of a graph share one clock; aligners join the others.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from inspect import Parameter, signature
 from itertools import repeat
 from numbers import Real
@@ -95,8 +95,8 @@ def _freeze(value: Any) -> None:
         for part in value.values() if isinstance(value, Mapping) else value:
             _freeze(part)
     elif is_dataclass(value):
-        for part in vars(value).values() if hasattr(value, "__dict__") else ():
-            _freeze(part)
+        for one in fields(value):
+            _freeze(getattr(value, one.name, None))
 
 
 @dataclass(frozen=True)

@@ -168,15 +168,15 @@ def run(
     every = every or Every()
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))
     stop, ledger = stop or Stop(), Ledger()
+    resumed = checkpoints.last if checkpoints is not None else None
+    if checkpoints is not None:
+        check_resumable(graph.stages, {use: sink for use, sink in graph.sinks if use in outputs})
     wall, cpu = time.perf_counter(), time.process_time()
     prepared = Prepass(graph)
     with suppress(_StoppedError):
         prepared = prepass(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
     graph = prepared.graph
     sinks = _Outputs.of(graph, outputs)
-    resumed = checkpoints.last if checkpoints is not None else None
-    if checkpoints is not None:
-        check_resumable(graph.stages, {use: sink for use, (sink, _) in sinks.sinks.items()})
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
     limits = {"workers": workers, "max_frames": workers + 1}
     engine = Engine(graph.stages, sinks.sinks, ledger, **limits, on_frame=on_frame, states=states, resumed=resumed)
@@ -279,6 +279,7 @@ def _feed(
     try:
         for _ in islice(frames, engine.through):  # before the checkpoint
             engine.report([True])
+        begun = time.perf_counter()
         for frame in frames:
             came = time.perf_counter()
             pace.wait(frame.stamp, stop.finishing)
@@ -305,6 +306,8 @@ def _keep(engine: Engine, checkpoints: Checkpoints | None) -> None:
     made = engine.checkpoint
     if checkpoints is not None and made is not None and made is not checkpoints.last:
         checkpoints.keep(made)
+    if checkpoints is not None and engine.unsaved:
+        checkpoints.give_up(engine.unsaved)
 
 
 def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:

@@ -7,10 +7,9 @@ images. The log gets its name when it is complete.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import groupby
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
@@ -135,18 +134,14 @@ class Ros2Writer:
         self._continued, left = before.partials, Counter(before.counts)
         partial = self.path.with_name(before.partials[0])
         path = partial if partial.exists() else self.path
-        with suppress(LogError), McapFile(path) as log:
-            own = {min(log.channels_of([topic]), default=-1) for topic in before.counts}
-            whole = (item for item in log.messages(own) if isinstance(item, RawMessage))
-            for _, items in groupby(whole, attrgetter("log_time")):
-                for item in items:
-                    channel = log.channels[item.channel]
-                    if left[channel.topic]:
-                        left[channel.topic] -= 1
-                        self.add(channel.topic, kind_of(channel), item.log_time, item.data)
-                self.flush()
-                if not left.total():
-                    break
+        for _, items in groupby(_messages_of(path, before.counts), lambda item: item[1].log_time):
+            for channel, item in items:
+                if left[channel.topic]:
+                    left[channel.topic] -= 1
+                    self.add(channel.topic, kind_of(channel), item.log_time, item.data)
+            self.flush()
+            if not left.total():
+                break
         if left.total():
             missing = counted(left.total(), "message")
             raise LogError(f"{path} lacks {missing} of the run that is to be resumed; run without --resume")
@@ -242,6 +237,15 @@ class Ros2Writer:
         if not held:
             self._partial.unlink(missing_ok=True)
         return f" (its first {counted(held, 'message')} are in {self._partial})" if held else ""
+
+
+def _messages_of(path: Path, topics: Iterable[str]) -> Iterator[tuple[Channel, RawMessage]]:
+    """The whole messages of the first channel of each topic; none of a log that cannot be read."""
+    with suppress(LogError), McapFile(path) as log:
+        own = {min(log.channels_of([topic]), default=-1) for topic in topics}
+        for item in log.messages(own):
+            if isinstance(item, RawMessage):
+                yield log.channels[item.channel], item
 
 
 def kind_of(channel: Channel) -> MessageKind:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -334,10 +335,10 @@ def _timed_place(message: Any, base_frame: str) -> tuple[float, float, float, fl
 
 def _apart(sampled: Iterable[tuple[float, float, float, float] | LogError]) -> float:
     """How far apart, m, the poses of two publishers are that alternate; 0 for those of one."""
-    places = {stamp: place for stamp, *place in (each for each in sampled if not isinstance(each, LogError))}
-    if len(places) < _MIN_POSES:
+    timed = sorted((each for each in sampled if not isinstance(each, LogError)), key=itemgetter(0))
+    if len(timed) < _MIN_POSES:
         return 0.0
-    at = np.array([places[stamp] for stamp in sorted(places)])
+    at = np.array([place for _, *place in timed])
     apart = float(np.median(np.linalg.norm(at[1:-1] - (at[:-2] + at[2:]) / 2, axis=1)))
     moved = float(np.median(np.linalg.norm(at[2:] - at[:-2], axis=1)))
     return apart if apart > max(_MIN_APART, _MIN_ALTERNATION * moved) else 0.0

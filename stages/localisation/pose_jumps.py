@@ -78,9 +78,9 @@ class PoseJumps:
         track = motion.segment, pose.frame_id
         now = _Frame(track, motion.stamp, motion.camera, logged, pose.transform, motion.covariance)
         last, self.last = self.last, now
-        if last is None:
-            self.first = now.stamp, pose.position
-        elif last.track[1] == pose.frame_id and now.stamp > last.stamp:
+        if last is None or last.track[1] != pose.frame_id:
+            self.first, self.moves = (now.stamp, pose.position), []
+        elif now.stamp > last.stamp:
             self.moves.append(_move(last, now, motion.inliers))
 
     def contradicted(self) -> list[Move]:

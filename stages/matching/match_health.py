@@ -30,10 +30,11 @@ UNMATCHED = (
     "pairs of different times, and for cameras that are swapped or hang upside down."
 )
 REPEATED = (
-    "In {count} of {total} frames, first at stamp {first:.2f} s, the ground repeats itself, as regular stripes along "
-    "the view do: up to {share:.0f} % of the sampled matches fit as well at another disparity. That ground may be "
-    "matched a period off, and the map be metres too low or too high. Compare its heights with known ones, such as "
-    "that of the ground at the wheels, or view it from another side: stripes across the view are matched correctly."
+    "In {count} of {total} frames, first {first:.1f} s after the first one, the ground repeats itself, as regular "
+    "stripes along the view do: up to {share:.0f} % of the sampled matches fit as well at another disparity. That "
+    "ground may be matched a period off, and the map be metres too low or too high. Compare its heights with known "
+    "ones, such as that of the ground at the wheels, or view it from another side: stripes across the view are matched "
+    "correctly."
 )
 
 
@@ -83,8 +84,8 @@ def _repetition(run: Sequence[MatchHealth]) -> list[str]:
     window = min(FRAMES_IN_A_ROW, len(shares))
     if not window or np.convolve(shares, np.full(window, 1 / window), "valid").max() < MIN_REPEATED:
         return []
-    stamps = [health.stamp for health in tested if health.repeated >= MIN_REPEATED]
-    return [REPEATED.format(count=len(stamps), total=len(run), first=stamps[0] / 1e9, share=100 * shares.max())]
+    times = [(health.stamp - run[0].stamp) / 1e9 for health in tested if health.repeated >= MIN_REPEATED]
+    return [REPEATED.format(count=len(times), total=len(run), first=times[0], share=100 * shares.max())]
 
 
 def _share(chosen: Array) -> float:

@@ -107,6 +107,7 @@ class Locked:
 @pytest.mark.parametrize("locked", [False, True])
 def test_a_task_goes_on_where_a_worker_died_if_the_pipeline_can(tmp_path, monkeypatch, locked):
     monkeypatch.setattr(checkpoint_file, "INTERVAL", 0.0)
+    monkeypatch.setattr(checkpoint_file, "MAX_SHARE", 1e9)
     write_log(Simulation(frames=6, width=120, height=96, relief_cells=256), tmp_path / "log.mcap")
     module = f"locked_{locked}"  # a module is imported once
     (tmp_path / f"{module}.py").write_text(STATES.format(locked=locked))

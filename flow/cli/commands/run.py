@@ -80,8 +80,6 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve or options.desk):
         raise UsageError("--view, --serve and --desk need the recording; leave out --no-rrd")
-    if options.resume and options.rate:
-        raise UsageError("--resume is for runs as fast as possible; leave out --rate")
     names = ("workers", "start", "end", "every", "rate", "profile", "desk", "with_inputs", "resume")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
@@ -91,11 +89,17 @@ def run(options: argparse.Namespace) -> int:
         say(headline(error.summary))
         with suppress(UnwritableError):  # the failed sink is the error to report
             write_text(options.summary, json.dumps(as_json(error.summary), indent=2))
+        _say_how_to_go_on(options, out)
         raise
     from stages.kernel_loading import compiled_now
 
     report(summary, compiled_now())
-    if checkpoint_of(out).exists():
-        say("the same command goes on from the last checkpoint")
+    _say_how_to_go_on(options, out)
     write_text(options.summary, json.dumps(summary, indent=2))
     return exit_code(summary)
+
+
+def _say_how_to_go_on(options: argparse.Namespace, out: Path) -> None:
+    """Print that a run which was stopped can go on."""
+    if options.resume and checkpoint_of(out).exists():
+        say("the same command goes on from the last checkpoint")

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from flow.errors import UsageError
+from flow.errors import SinkError, UsageError
 from flow.runtime.checkpoint import Checkpoint
 from flow.runtime.interrupts import Stop
 from flow.runtime.run import run
-from tests.flow.toys import MS, Keep, Kept, Log, Total, graph, traverse
+from tests.flow.toys import MS, Couple, Keep, Kept, Log, Total, graph, traverse
 
 FRAMES = 10
 PIPELINE = """
@@ -45,6 +45,7 @@ class InMemory:
 
     last: Checkpoint | None = None
     all: list[Checkpoint] = field(default_factory=list)
+    given_up: str = ""
 
     def due(self) -> bool:
         return True
@@ -52,6 +53,9 @@ class InMemory:
     def keep(self, checkpoint: Checkpoint) -> None:
         self.last = checkpoint
         self.all.append(checkpoint)
+
+    def give_up(self, why: str) -> None:
+        self.given_up = why
 
 
 def replayed(tmp_path, events, checkpoints=None, workers=3, text=PIPELINE, **options):
@@ -139,3 +143,32 @@ def test_what_cannot_go_on_is_refused_before_the_first_frame(tmp_path, change, s
     with pytest.raises(UsageError, match=f"this pipeline cannot be resumed: {sentence}.*; leave out --resume"):
         replayed(tmp_path, traverse(3), InMemory(), text=text)
     assert replayed(tmp_path, traverse(3), text=text)[1]["frames_in"] == 3
+
+
+@dataclass(frozen=True)
+class LaterLocked(Total):
+    """Has a state that cannot be pickled after two frames."""
+
+    def __call__(self, couple: Couple, *, state: list[Any]) -> Couple:
+        """The couple."""
+        state.append(couple.value if len(state) < 2 else lambda: None)
+        return couple
+
+    def finding(self, state: list[Any]) -> None:
+        """Nothing."""
+
+
+def test_a_state_that_cannot_be_saved_later_ends_the_checkpoints_and_not_the_run(tmp_path, events):
+    kept, text = InMemory(), PIPELINE.replace("toys.Total", "runtime.test_checkpoint.LaterLocked")
+    records, summary = replayed(tmp_path, events, kept, text=text)
+    assert (summary["frames_through"], len(records)) == (FRAMES - 1, FRAMES - 1)
+    assert kept.given_up.startswith("the state of 'total' cannot be pickled: ")
+    assert max((checkpoint.frames for checkpoint in kept.all), default=0) <= 3  # of which one fails before
+
+
+def test_no_checkpoint_follows_a_frame_that_a_sink_could_not_write(tmp_path):
+    kept, pipeline = InMemory(), graph(tmp_path, text=PIPELINE.replace("Continued}", "Continued, fail_at: 5}"))
+    ((use, _),) = pipeline.sinks
+    with pytest.raises(SinkError):
+        run(pipeline, Log(traverse(FRAMES)), {use: Path("unused")}, workers=1, checkpoints=kept)
+    assert max(checkpoint.frames for checkpoint in kept.all) <= 5

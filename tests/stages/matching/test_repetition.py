@@ -40,7 +40,7 @@ def test_stripes_along_the_view_are_matched_a_period_off_with_a_warning(pipeline
     assert wrong_share(disparity, truth) > 0.5
     found = check.finding()
     assert found.severity == Severity.WARNING
-    assert "In 1 of 1 frames, first at stamp 0.00 s, the ground repeats itself" in found.sentence
+    assert "In 1 of 1 frames, first 0.0 s after the first one, the ground repeats itself" in found.sentence
     assert check.state[0].repeated > 0.7
 
 
@@ -80,7 +80,7 @@ def test_the_warning_asks_for_frames_in_a_row():
     assert sentence([np.nan, np.nan]) is None
     assert sentence([0.1, 0.1, 0.8, 0.1, 0.1, 0.1]) is None
     seen = sentence([0.1, 0.1, np.nan, 0.6, 0.8, 0.5, 0.1, 0.1])
-    assert "In 3 of 8 frames, first at stamp 3.00 s, " in seen
+    assert "In 3 of 8 frames, first 3.0 s after the first one, " in seen
     assert "up to 80 % of the sampled matches" in seen
 
 
