@@ -90,14 +90,14 @@ class Strict:
 
 
 def test_a_variant_whose_stage_fails_says_why_and_the_others_are_scored(traverse, tmp_path, said):
-    (tmp_path / "strict.py").write_text(STRICT)
+    (tmp_path / "limited.py").write_text(STRICT)
     own = said(0, "pipeline", "fast").out.replace("frame: rectified", "frame: passed")
-    text = own.replace("streams:", "streams:\n  passed: {use: strict.Strict, frame: rectified}", 1)
+    text = own.replace("streams:", "streams:\n  passed: {use: limited.Strict, frame: rectified}", 1)
     (tmp_path / "own.yaml").write_text(text)
     words = ("try", traverse, "--at", "0.5", "-p", tmp_path / "own.yaml")
     values = [f"--set=passed.limit={number}" for number in (2, 1)]
     output = said(0, *words, *values, "-o", tmp_path / "try.rrd").out
-    assert "note: B lost 1 frame, first in passed@B: ValueError: too strict (strict.py, line 12" in output
+    assert "note: B lost 1 frame, first in passed@B: ValueError: too strict (limited.py, line 12" in output
     rows = {line.split()[0]: line.split()[1:] for line in output.splitlines() if re.match(r" +[A-C] +[-\d]", line)}
     assert (rows["A"] == rows["C"], set(rows["B"])) == (True, {"-"})
     assert "\nB not scored: it contains none of /nav/disparity, " in output
