@@ -15,8 +15,8 @@ from flow.runtime.checkpoint import Checkpoint
 from recordings.atomic_write import give_name, temporary_name, writing
 from recordings.errors import UnwritableError
 
-INTERVAL = 10.0  # s, between checkpoints, and
-MAX_SHARE = 0.02  # of the time that writing them takes
+INTERVAL = 10.0  # s, between checkpoints
+MAX_SHARE = 0.02  # of the time, that may go into writing them
 _REMEDY = "run without --resume to begin with the first frame"
 _MAGIC = b"roverflow checkpoint\n"
 _NAMES = {  # of facts, in words

@@ -21,8 +21,8 @@ from stages.stage import Stage, check_joined, check_same_time, check_types
 NEAR_ROWS = 0.125  # share of the rows that show the nearest ground
 MIN_CONFIDENCE = 0.35  # of a match; those that OpenCV finds of ground closer than the search range have less
 MIN_MATCHED = 0.7  # share of the nearest ground, in the median of the frames
-# Share of the sampled matches with a rival, on average over frames in a row. In wrong maps it was at least 0.4, with
-# stripes on a small part of the ground 0.28; in single frames of sand, gravel, rocks and rooms, at most 0.12.
+# Share of the sampled matches with a rival, on average over frames in a row. In test_repetition.py it is less than 0.2
+# on simulated ground, and more than 0.7 on stripes.
 MIN_REPEATED, FRAMES_IN_A_ROW = 0.25, 5
 UNMATCHED = (
     "Only {near:.0f} % of the nearest ground is matched, so the map is unreliable there. If that ground is closer than "

@@ -86,7 +86,8 @@ def _find_rivals(left, right, pixels, samples, noise, half_width, infinity, reac
 def _add_costs(left, right, begin, first, last, fraction, window, strip, costs):
     """Add the costs of one row to `costs`; return the squares of the left window and its mean.
 
-    begin: first column of the left window; first, last: of the right windows, of which each begins `fraction` later.
+    begin: first column of the left window; first, last: first columns of the first and the last right window; fraction:
+    px, by which each right window is shifted.
     """
     length = window.shape[0]
     mean = F32(0)

@@ -163,7 +163,7 @@ def test_a_state_that_cannot_be_saved_later_ends_the_checkpoints_and_not_the_run
     records, summary = replayed(tmp_path, events, kept, text=text)
     assert (summary["frames_through"], len(records)) == (FRAMES - 1, FRAMES - 1)
     assert kept.given_up.startswith("the state of 'total' cannot be pickled: ")
-    assert max((checkpoint.frames for checkpoint in kept.all), default=0) <= 3  # of which one fails before
+    assert max((checkpoint.frames for checkpoint in kept.all), default=0) <= 3  # one of them fails
 
 
 def test_no_checkpoint_follows_a_frame_that_a_sink_could_not_write(tmp_path):
