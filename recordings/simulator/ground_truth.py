@@ -136,10 +136,10 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
     mean, in_view = np.full(x.shape, np.nan, np.float32), (visible > 0).astype(np.float32)
     mean[row, col] = (heights - truth.level.translation[2]).reshape(fine_x.shape).mean(axis=1)
     mean[visible == 0] = np.nan
-    unseen = np.repeat(visible[row, col] == 0, CELL_POINTS**2)
-    sighted = np.zeros(len(world), bool)
-    sighted[unseen] = in_sight(simulation, truth, world[unseen])
-    in_view[row, col] = np.maximum(in_view[row, col], sighted.reshape(fine_x.shape).any(axis=1))
+    points = world.reshape(len(row), CELL_POINTS**2, 3)
+    for number in range(CELL_POINTS**2):  # one point in sight is enough
+        left = np.flatnonzero(in_view[row, col] == 0)
+        in_view[row[left], col[left]] = in_sight(simulation, truth, points[left, number])
     height = np.append(terrain.rocks.height, 0.0)[np.maximum(surface, raycast.GROUND)]
     centre = truth.level(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
     slope = terrain.slope(centre[:, 0], centre[:, 1], 1.0).reshape(x.shape)

@@ -12,6 +12,7 @@ import psutil
 import pytest
 from distributed import Client
 
+from flow.cli.fleet import engine
 from recordings.simulator import Simulation, write_log
 from tests.conftest import roverflow
 from tests.fleet.test_fleet import PIPELINE, rows_of
@@ -170,6 +171,7 @@ def test_workers_of_another_version_are_refused(home, tmp_path, refused, package
     assert not list((tmp_path / "out").glob("*-nav.mcap"))
 
 
-def test_a_scheduler_that_is_not_there_is_named(home, tmp_path, refused):
-    words = ("fleet", home / "log00.mcap", "--out", tmp_path / "out", *PIPELINE, "--cluster", "tcp://127.0.0.1:1")
+def test_a_scheduler_that_is_not_there_is_named(traverse, tmp_path, refused, monkeypatch):
+    monkeypatch.setattr(engine, "CLUSTER_SECONDS", 1.0)
+    words = ("fleet", traverse, "--out", tmp_path / "out", *PIPELINE, "--cluster", "tcp://127.0.0.1:1")
     assert "no Dask scheduler answers at tcp://127.0.0.1:1" in refused(*words)

@@ -18,7 +18,7 @@ from flow.errors import INCOMPLETE, RoverflowError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
 
 POLL_SECONDS = 1.0
-WORKER_SECONDS = 20.0  # for which a fleet waits for the first worker of a cluster
+CLUSTER_SECONDS = 20.0  # for which a fleet waits for a scheduler, and for its first worker
 WORKER_DEATHS = 1  # of a log that is tried once more; the next death sets it aside
 
 
@@ -83,7 +83,7 @@ class Fleet:
         """Refuse workers of another version, pipeline or machine, and those that do not see the logs or the stages."""
         task = next(iter(self.tasks.values()))
         with suppress(TimeoutError):
-            client.wait_for_workers(1, timeout=WORKER_SECONDS)
+            client.wait_for_workers(1, timeout=CLUSTER_SECONDS)
         found = client.run(about_worker, task)
         if not found:
             raise UsageError("the cluster has no workers; start some")
@@ -199,7 +199,7 @@ def cluster(address: str | None, processes: int, cores: int, memory: str, dashbo
     )  # fmt: skip
     if address is not None:
         try:
-            client = Client(address, timeout=20)
+            client = Client(address, timeout=CLUSTER_SECONDS)
         except (OSError, TimeoutError, ValueError, TypeError) as error:  # a type: no certificates for TLS
             raise UsageError(f"no Dask scheduler answers at {address}: {error}") from error
         with client:

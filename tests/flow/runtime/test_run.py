@@ -205,7 +205,8 @@ def test_an_interrupt_in_the_wait_for_a_frame_gives_it_back(tmp_path, monkeypatc
     assert summary["interrupted"]
 
 
-def test_the_latency_is_that_of_stages_that_do_not_wait_for_the_next_frame(tmp_path):
+def test_the_latency_is_that_of_stages_that_do_not_wait_for_the_next_frame(tmp_path, monkeypatch):
+    monkeypatch.setattr("random.random", lambda: 1.0)  # whole naps
     _, summary = replayed(graph(tmp_path, nap=0.005), traverse(3))
     assert 0.005 <= summary["latency_seconds"]["median"] <= summary["latency_seconds"]["maximum"]
     assert latency([]) == {}

@@ -1,11 +1,20 @@
 """The recording of a difference."""
 
 import numpy as np
+import pytest
 
+import recordings.comparison.recording
 from recordings.comparison.diff import MessageDifference
-from recordings.comparison.recording import MAX_FRAMES, DiffRecording
+from recordings.comparison.recording import DiffRecording
 from recordings.ros2.to_msg import occupancy_grid, odometry
 from stages.data import NavigationMap, Pose
+
+MAX_FRAMES = 3
+
+
+@pytest.fixture(autouse=True)
+def few_frames(monkeypatch):
+    monkeypatch.setattr(recordings.comparison.recording, "MAX_FRAMES", MAX_FRAMES)
 
 
 def test_frames_beyond_the_largest_number_are_counted_once_for_all_their_topics():

@@ -121,10 +121,12 @@ def test_python_calls_no_function_that_only_kernels_can_call():
     }
     assert "root" in parts["stages.compiled.union_find"]
     for module, tree in trees.items():
-        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module in parts]
-        known = parts[module] | {name.name for node in imports for name in node.names} & set.union(
-            set(), *(parts[node.module] for node in imports)
+        imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+        known = parts[module].union(
+            *({name.name for name in node.names} & parts.get(node.module, set()) for node in imports)
         )
+        if not known:
+            continue
         compiled = [each for each in functions(tree) if decorators(each) & JITS]
         inside = {id(node) for each in compiled for node in ast.walk(each)}
         called = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call) and id(node) not in inside]
