@@ -9,10 +9,12 @@ from dataclasses import Field, dataclass, fields
 from functools import cache
 from typing import Any, Self, get_args, get_type_hints
 
+import numpy as np
+
 from flow.contracts import StageError
 from flow.parameters import Checked
 from flow.parameters import parameter as parameter
-from stages.data import LEVEL_FRAME, Disparity, PointCloud, StereoFrame
+from stages.data import LEVEL_FRAME, Disparity, PixelOrigin, PointCloud, StereoFrame
 
 MAX_CELLS = 4000  # cells, of a map
 
@@ -117,6 +119,17 @@ def check_joined(stage: Stage, frame: StereoFrame, disparity: Disparity) -> None
             f"{type(stage).__name__}: the disparity is {disparity.pixels.shape}, the left image "
             f"{frame.left.shape[:2]}; join the disparity with the rectified frame it was made from"
         )
+
+
+def check_confidence(stage: Stage, disparity: Disparity) -> None:
+    """Raise StageError if a matched disparity has no confidence, as those that a result log contains."""
+    if np.isnan(disparity.confidence.max(initial=0)):  # quick: NaN passes on
+        matched = disparity.confidence[disparity.source == PixelOrigin.MEASURED]
+        if np.isnan(matched).any():
+            raise StageError(
+                f"{type(stage).__name__}: the confidence of matched pixels is NaN; a result log does not keep it: give "
+                "the disparity one by dataclasses.replace(disparity, confidence=...)"
+            )
 
 
 def check_same_time(stage: Stage, **stamps: int) -> None:

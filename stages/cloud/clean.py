@@ -47,7 +47,7 @@ class Clean(Stage):
 
     method: str = parameter("organised", "outlier removal", choices=("organised", "knn"))
     max_range: float = parameter(8.0, "horizontal range wanted in the map", unit="m", low=0.1, high=200.0)
-    margin: float = parameter(1.0, "added to max_range for the crop around the camera", unit="m", low=0.0)
+    margin: float = parameter(1.0, "added to max_range for the crop around the camera", unit="m", low=0.0, high=200.0)
 
     def __call__(self, cloud: PointCloud) -> PointCloud:
         """The near points of `cloud` that are no outliers, in their order; there may be none."""
@@ -65,8 +65,6 @@ class Clean(Stage):
         """Mask of the points kept by their neighbours in the image; points not measured are only cropped."""
         if cloud.shape is None:
             raise StageError("Clean: the cloud has no image shape; set it, or use method: knn")
-        if len(cloud.pixel) and not 0 <= cloud.pixel.min() <= cloud.pixel.max() < cloud.shape[0] * cloud.shape[1]:
-            raise StageError(f"Clean: the cloud has pixel indices outside its image of shape {cloud.shape}")
         measured = cloud.measured
         chosen = np.zeros(len(measured), bool)
         chosen[self._supported(cloud, measured, cloud.shape)] = True

@@ -11,15 +11,15 @@ from dataclasses import dataclass
 from stages.cloud.kernels.triangulation import triangulate
 from stages.data import Disparity, PointCloud, StereoFrame
 from stages.matching.intensity import eight_bit
-from stages.stage import Stage, check_joined, parameter
+from stages.stage import Stage, check_confidence, check_joined, check_same_time, parameter
 
 
 @dataclass(frozen=True)
 class Reproject(Stage):
     """Triangulates a disparity image.
 
-    The standard deviation of a matched disparity is its own, `Disparity.sigma`. Where the image has none, it falls
-    with the confidence (see "Stated sigmas" in docs/terrain.md).
+    The standard deviation of a matched disparity is its own, `Disparity.sigma`. Where it has none, it falls with
+    the confidence (see "Stated sigmas" in docs/terrain.md).
 
     Examples
     --------
@@ -44,6 +44,9 @@ class Reproject(Stage):
     def __call__(self, frame: StereoFrame, disparity: Disparity) -> PointCloud:
         """The cloud of `disparity`, with the colours of the left image in 8 bit; it may be empty."""
         check_joined(self, frame, disparity)
+        check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
+        if disparity.sigma is None:
+            check_confidence(self, disparity)
         camera = disparity.camera or frame.camera
         colors = eight_bit(frame.left)[0]
         points, rgb, sigma, pixel = triangulate(

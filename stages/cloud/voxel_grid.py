@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flow.contracts import StageError
 from stages.cloud.kernels.voxels import voxel_means
 from stages.data import LEVEL_FRAME, PointCloud, VoxelMap
 from stages.data.arrays import rows_of
-from stages.stage import Stage, check_cells, check_level, parameter
+from stages.stage import MAX_CELLS, Stage, check_cells, check_level, parameter
 
 
 @dataclass(frozen=True)
@@ -44,5 +45,11 @@ class VoxelGrid(Stage):
         x, y = cloud.points[:, 0], cloud.points[:, 1]
         inside = cloud.measured & np.isfinite(cloud.points[:, 2]) & (x * x + y * y <= self.max_range**2)
         points, colors = rows_of(cloud.points, inside), rows_of(cloud.colors, inside)
+        height = float(np.abs(points[:, 2]).max(initial=0))
+        if height > MAX_CELLS * self.resolution:
+            raise StageError(
+                f"VoxelGrid: a point is {height:g} m above or below the origin; the limit is {MAX_CELLS} voxels of "
+                f"{self.resolution:g} m; remove outliers with stages.Clean"
+            )
         index, count, colors = voxel_means(points, colors, self.resolution)
         return VoxelMap(cloud.stamp, index, colors, count, self.resolution, LEVEL_FRAME)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
 
+from flow.contracts import StageError
 from stages.data.arrays import Array, check_resolution, publish, publish_plain, rows_of
 from stages.data.motion import Transform
 from stages.data.pixel_validity import PixelOrigin
@@ -65,6 +67,15 @@ class PointCloud:
         publish(self, "pixel", (n,), np.int32)
         if self.source is not None:
             publish(self, "source", (n,), np.uint8)
+        if self.shape is not None:
+            self._check_pixels(self.shape)
+
+    def _check_pixels(self, shape: tuple[int, int]) -> None:
+        """Raise StageError for a shape that is none of an image, and for a pixel outside the image."""
+        if len(shape) != 2 or not all(isinstance(extent, Integral) and extent > 0 for extent in shape):
+            raise StageError(f"PointCloud.shape must be (rows, columns), at least (1, 1), not {shape}")
+        if len(self.pixel) and not 0 <= self.pixel.min() <= self.pixel.max() < shape[0] * shape[1]:
+            raise StageError(f"PointCloud.pixel has indices outside an image of shape {shape}")
 
     @property
     def measured(self) -> Array:
@@ -78,6 +89,13 @@ class PointCloud:
             values = getattr(self, name)
             fields[name] = None if values is None else rows_of(values, kept)
         return replace(self, **fields)
+
+
+def in_raster_order(cloud: PointCloud) -> PointCloud:
+    """The cloud with its points in the order of their pixels, as an image has them."""
+    if (cloud.pixel[1:] >= cloud.pixel[:-1]).all():
+        return cloud
+    return cloud.only(np.argsort(cloud.pixel, kind="stable"))
 
 
 @dataclass(frozen=True, eq=False)

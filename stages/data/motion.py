@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -111,9 +112,13 @@ class Tilt:
 
         Samples of a filter are smooth already, so the tilt is interpolated between two of them.
         """
+        if not samples:
+            raise StageError("Tilt.smoothed: there are no samples")
         if samples[0].filtered:
-            later = next(number for number in range(1, len(samples)) if samples[number].stamp >= stamp)
-            return samples[later - 1].interpolated(samples[later], stamp)
+            for sample, later in pairwise(samples):
+                if later.stamp >= stamp:
+                    return sample.interpolated(later, stamp)
+            raise StageError(f"Tilt.smoothed: {stamp} ns is after the last sample")
         seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
         line = np.column_stack([np.ones_like(seconds), seconds])
         weights = np.linalg.pinv(line)[0]

@@ -24,8 +24,13 @@ def disparity_rows(disparity: Disparity, first: int, end: int) -> Disparity:
 
 
 def rows_without_sigma(disparity: Disparity) -> range:
-    """The rows of a partly refined disparity image that have no sigma: they are to be refined. Else no row."""
-    rows = np.empty(0, int) if disparity.sigma is None else np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
+    """The rows of a partly refined disparity image that have no sigma: they are to be refined. Else no row.
+
+    An image is partly refined if it has known pixels with a sigma and others without.
+    """
+    if disparity.sigma is None or not (np.isnan(disparity.sigma) & ~np.isnan(disparity.pixels)).any():
+        return range(0)
+    rows = np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
     return range(rows[0], rows[-1] + 1) if 0 < len(rows) < len(disparity.pixels) else range(0)
 
 

@@ -14,7 +14,7 @@ from flow.contracts import Finding, counted
 from stages.data import Array, CameraMotion, Disparity, StereoFrame, Transform
 from stages.data.covariance import cross_matrix, translated_covariance
 from stages.localisation.vo_tracking import MIN_FEATURES, Step, VoFrame, step_between, vo_frame
-from stages.stage import Stage, check_joined
+from stages.stage import Stage, check_joined, check_same_time
 
 MAX_RMS = 2.0  # px, reprojection error of a motion
 MAX_MOTION = 5.0  # m, between two frames
@@ -63,6 +63,7 @@ class VisualOdometry(Stage):
     def __call__(self, frame: StereoFrame, disparity: Disparity, *, state: OdometryMemory) -> CameraMotion:
         """The camera's motion since its segment began; `camera` is None if the frame has too few features."""
         check_joined(self, frame, disparity)
+        check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
         before, now = state.keyframe, vo_frame(frame, disparity)
         step = step_between(before.frame, now) if before is not None else None
         if before is not None and step is not None and _plausible(step):

@@ -66,7 +66,7 @@ class Step:
 def vo_frame(frame: StereoFrame, disparity: Disparity) -> VoFrame:
     """The features of the left image, with the points of those that have a disparity."""
     image = frame.once(gray_pair)[0]
-    shrink = max(1, round(image.shape[1] / DETECTION_WIDTH))
+    shrink = max(1, min(round(image.shape[1] / DETECTION_WIDTH), image.shape[0]))
     small = cv2.resize(image, None, fx=1 / shrink, fy=1 / shrink, interpolation=cv2.INTER_AREA) if shrink > 1 else image
     pixels, descriptors = orb_features(small, MAX_FEATURES, scale=1.3, levels=5)
     pixels = (pixels + 0.5) * shrink - 0.5

@@ -89,7 +89,7 @@ class Match(Stage):
     )  # fmt: skip
     uniqueness: int = parameter(0, "margin by which the best path sum must beat the next", low=0, high=254)
     lr_tolerance: int = parameter(2, "largest left-right difference", unit="px", low=0, high=64)
-    max_speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0)
+    max_speckle_size: int = parameter(40, "largest isolated patch that is dropped, in pixels", low=0, high=10**9)
     prior_weight: float = parameter(0.5, "cost of each pixel of distance from the prior", low=0, high=16)
     weak_texture_gain: float = parameter(
         4.0, "factor of `prior_weight` where noise leaves a match uncertain by 1 px", low=1, high=MAX_GAIN

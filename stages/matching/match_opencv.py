@@ -61,7 +61,7 @@ class MatchOpenCV(Stage):
     )
     uniqueness: int = parameter(1, "margin in percent by which the best cost must beat the next", low=0, high=100)
     lr_tolerance: int = parameter(1, "largest left-right difference", unit="px", low=1, high=64)
-    max_speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0)
+    max_speckle_size: int = parameter(100, "largest isolated patch that is dropped, in pixels", low=0, high=10**9)
     speckle_range: int = parameter(1, "disparity step that separates patches", unit="px", low=1)
     color: bool = parameter(False, "match on RGB instead of gray")
 

@@ -15,7 +15,7 @@ from stages.matching.intensity import eight_bit, gray
 from stages.refinement.kernels.bilateral import joint_bilateral
 from stages.refinement.kernels.plane_apply import near_median
 from stages.refinement.kernels.wls import smooth
-from stages.stage import Stage, check_joined, check_same_time, parameter
+from stages.stage import Stage, check_confidence, check_joined, check_same_time, parameter
 
 F32 = np.float32
 UNLIMITED = 1e9  # px: the median replaces every match
@@ -64,6 +64,7 @@ class RefinePaper(Stage):
         """Refine `disparity`, the left disparity of the rectified `frame`."""
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
+        check_confidence(self, disparity)
         image, _ = eight_bit(frame.left, frame.right)
         guide = gray(image)
         matches = np.where(disparity.source == PixelOrigin.MEASURED, disparity.pixels, F32(np.nan))
@@ -87,7 +88,7 @@ class RefinePaper(Stage):
 
     def _planar(self, matches: Array, labels: Array, seed: int) -> Array:
         """The matches of each superpixel replaced by its RANSAC plane, (H, W) float32; holes stay NaN."""
-        planar, random = matches.copy(), np.random.default_rng(seed)
+        planar, random = matches.copy(), np.random.default_rng(seed % 2**64)
         known = np.flatnonzero(np.isfinite(matches))
         order = known[np.argsort(labels.ravel()[known], kind="stable")]
         sizes = np.bincount(labels.ravel()[known], minlength=labels.max() + 1)

@@ -29,7 +29,7 @@ from stages.refinement.kernels.slic import superpixels
 from stages.refinement.kernels.subpixel import fit_brightness
 from stages.refinement.kernels.support import supported
 from stages.refinement.kernels.valid_extent import Extent, extent
-from stages.stage import Stage, check_joined, check_same_time, parameter
+from stages.stage import Stage, check_confidence, check_joined, check_same_time, parameter
 
 F32 = np.float32
 SATURATION_LEVEL = 250  # 8-bit level from which an even patch is saturated, a sky for example
@@ -131,6 +131,7 @@ class Refine(Stage):
         """Refine `disparity`, the left disparity of the rectified `frame`."""
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
+        check_confidence(self, disparity)
         rows = rows_without_sigma(disparity)
         if not rows:
             return self._refined(frame, disparity)

@@ -51,8 +51,9 @@ class Binarise(Stage):
     )
     hazard_margin: float = parameter(0.05, "cells this near to an obstacle are hazards too", unit="m", low=0.0)
     max_sigma: float = parameter(
-        0.067, "largest standard deviation of the height of a free cell (a third of a step)", unit="m", low=0.0
-    )
+        0.067, "largest standard deviation of the height of a free cell (a third of a step)", unit="m", low=0.0,
+        high=100.0,
+    )  # fmt: skip
     min_drop: float = parameter(
         0.1, "depth below its surroundings from which hidden ground may be a drop; only part of a ditch's depth is "
         "measurable", unit="m", low=0.0,
@@ -175,7 +176,7 @@ class Binarise(Stage):
 
     def _brink(self, elevation: ElevationMap) -> Array:
         """Cells within half a wheel of hidden ground that falls away, (rows, cols) bool."""
-        if "drop" not in elevation.layers:
+        if not {"drop", "occluded"} <= elevation.layers.keys():
             return np.zeros(elevation.shape, bool)
         hidden = elevation.layers["occluded"] == 1
         falls = hidden & (elevation.layers["drop"] >= self.min_drop)
@@ -189,7 +190,7 @@ class Binarise(Stage):
 
         Matching smears the near edge and the far wall of a ditch. Their heights fill most of it, and lift its ceiling.
         """
-        if "drop" not in elevation.layers:
+        if not {"drop", "occluded"} <= elevation.layers.keys():
             return np.zeros(elevation.shape, bool)
         wheel = self.rover.wheel / elevation.resolution
         low = (elevation.layers["occluded"] == 1) & (elevation.layers["drop"] >= MIN_HOLE_SHARE * self.min_drop)

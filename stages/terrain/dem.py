@@ -13,6 +13,7 @@ import numpy as np
 
 from stages.data import LEVEL_FRAME, Array, ElevationMap, PointCloud
 from stages.data.arrays import spanned
+from stages.data.cloud import in_raster_order
 from stages.stage import Stage, check_cells, check_level, parameter
 from stages.terrain.kernels.cell_layers import VARIANCE, cell_layers
 from stages.terrain.kernels.grid import FIGURES, Grid, cell_statistics, extent
@@ -50,11 +51,11 @@ class Voxelise(Stage):
     )
     splat_sigmas: float = parameter(
         0.0, "reach of a measured point along its line of sight, in standard deviations of its depth, into cells "
-        "without points; 0 = none", low=0.0,
+        "without points; 0 = none", low=0.0, high=100.0,
     )  # fmt: skip
     max_splat: float = parameter(
         0.08, "longest reach in depth; behind depth edges, where depth is most uncertain, the ground is hidden",
-        unit="m", low=0.0,
+        unit="m", low=0.0, high=200.0,
     )  # fmt: skip
     filled: str = parameter(
         "apart", "PLANE and FILLED points: a layer of their own, or counted as measured", choices=("apart", "counted")
@@ -84,7 +85,7 @@ class Voxelise(Stage):
     def in_view(self, cloud: PointCloud) -> tuple[Grid, dict[str, Array]]:
         """The part of the grid that a levelled cloud shows, and its layers there, (rows, cols) float32."""
         whole = self.whole
-        measured, guessed = self._split(cloud)
+        measured, guessed = self._split(in_raster_order(cloud))
         ceiling, staying, sensor = None, None, cloud.sensor
         if sensor is not None and cloud.shape is not None:
             ceiling = occlusion_ceiling(measured.points, measured.pixel, cloud.shape[1], sensor.translation, whole)

@@ -44,23 +44,27 @@ class FuseRegion(Stage):
     max_range: float = parameter(
         8.0, "horizontal range from the rover that a frame adds to the map", unit="m", low=0.1, high=200.0
     )
-    tilt_sigma: float = parameter(0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0)
-    height_sigma: float = parameter(0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0)
+    tilt_sigma: float = parameter(
+        0.005, "standard deviation of a frame's tilt (0.3 degrees)", unit="rad", low=0.0, high=0.5
+    )
+    height_sigma: float = parameter(
+        0.05, "standard deviation of the pose's height against the map", unit="m", low=0.0, high=100.0
+    )
     attitude_sigma: float = parameter(
         0.0009, "standard deviation of the pose's roll and pitch, if it has no covariance (0.05 degrees)", unit="rad",
-        low=0.0,
+        low=0.0, high=0.5,
     )  # fmt: skip
     height_drift: float = parameter(
-        0.002, "error of the pose's height per metre of the drive, if it has no covariance", low=0.0
+        0.002, "error of the pose's height per metre of the drive, if it has no covariance", low=0.0, high=1.0
     )
     tilt_bias: float = parameter(
         np.deg2rad(0.1), "standard deviation of the error common to all tilts", unit="rad", low=0.0, high=0.2
     )
     position_sigma: float = parameter(
-        0.012, "standard deviation of a frame's horizontal position against the map", unit="m", low=0.0
+        0.012, "standard deviation of a frame's horizontal position against the map", unit="m", low=0.0, high=100.0
     )
     alignment_sigma: float = parameter(
-        0.002, "standard deviation of a cell's height that the alignment leaves", unit="m", low=1e-4
+        0.002, "standard deviation of a cell's height that the alignment leaves", unit="m", low=1e-4, high=100.0
     )
 
     def __post_init__(self) -> None:
@@ -156,7 +160,7 @@ class FuseRegion(Stage):
             raise StageError(
                 f"{type(self).__name__}: the cloud lacks its camera's pose, `sensor`; stages.Level adds it"
             )
-        if cloud.stamp <= state.last and state.logged is None:
+        if state.last is not None and cloud.stamp <= state.last and state.logged is None:
             raise StageError(
                 f"{type(self).__name__}: the cloud of {cloud.stamp} ns is not later than the last one, {state.last} ns"
             )

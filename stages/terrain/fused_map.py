@@ -35,7 +35,7 @@ class FusedMap:
 
     frame_id: str | None = None  # "" is a valid name
     epoch: int = 0  # ns, stamp of the first frame
-    last: int = -1  # ns, stamp of the last frame
+    last: int | None = None  # ns, stamp of the last frame
     has_ceiling: bool = False  # whether the frames contain occluded cells
     cells: Tiles = field(default_factory=lambda: Tiles(CELL))
     levelling: MapLevelling | None = None  # None before the first frame

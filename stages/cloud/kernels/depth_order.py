@@ -60,7 +60,7 @@ def out_of_order_reference(inverse: Array, patch: Array, sizes: Array) -> Array:
     for _ in range(ROUNDS):
         votes = np.zeros(len(sizes), np.int64)
         for column, numbers in zip(inverse.T, patch.T, strict=True):
-            rows = np.flatnonzero((numbers >= 0) & ~gone[numbers])
+            rows = np.flatnonzero((numbers >= 0) & ~np.append(gone, True)[numbers])
             for above, under in pairwise(rows):
                 one, other = numbers[above], numbers[under]
                 if one != other:

@@ -52,9 +52,9 @@ def triangulate(
 
 def _dense_limits(camera: StereoCamera, max_spacing: float) -> Array:
     """The disparity, px, from which a pixel is left out, (4, 4) by the last two bits of its row and of its column."""
-    every_2nd = 2 * camera.baseline / max_spacing if max_spacing > 0 else np.inf
-    rows = np.array([np.inf, every_2nd, 2 * every_2nd, every_2nd])
-    return np.asarray(np.minimum(rows[:, None], rows / COLUMN_SPACING))
+    every_2nd = 2 * camera.baseline / max_spacing if max_spacing > 0 else np.inf  # of square pixels
+    lines = np.array([np.inf, every_2nd, 2 * every_2nd, every_2nd])
+    return np.asarray(np.minimum(lines[:, None] * (camera.fx / camera.fy), lines / COLUMN_SPACING))
 
 
 @part
@@ -99,7 +99,7 @@ def _triangulate(disparity, source, confidence, colors, camera, max_depth, fille
                 sigma_d = SIGMA_FILLED
             elif origin == _PLANE:
                 sigma_d = SIGMA_PLANE
-            elif own.size:
+            elif own.size and not np.isnan(own[row, col]):
                 sigma_d = np.float64(own[row, col])
             else:
                 trust = min(np.float64(confidence[row, col]), 1.0) if confidence[row, col] > 0.0 else 0.0
@@ -131,7 +131,9 @@ def triangulate_reference(
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
     trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
     sigma_d = SIGMA_WORST * (SIGMA_BEST / SIGMA_WORST) ** trust
-    sigma_d = sigma_d if disparity.sigma is None else disparity.sigma[v, u].astype(np.float64)
+    if disparity.sigma is not None:
+        own = disparity.sigma[v, u].astype(np.float64)
+        sigma_d = np.where(np.isnan(own), sigma_d, own)
     sigma_d = np.where(source[v, u] == PixelOrigin.PLANE, SIGMA_PLANE, sigma_d)
     sigma_d = np.where(source[v, u] == PixelOrigin.FILLED, SIGMA_FILLED, sigma_d)
     sigma_z = z * z / (camera.fx * camera.baseline) * sigma_d

@@ -201,5 +201,8 @@ def test_a_levelled_cloud_and_a_wrong_image_shape_are_refused():
         Clean()(replace(cloud, sensor=sensor, frame_id=LEVEL_FRAME))
     with pytest.raises(ValueError, match="method: knn"):
         Clean()(replace(cloud, shape=None))
-    with pytest.raises(ValueError, match="outside its image"):
-        Clean()(replace(cloud, shape=(100, 100)))
+    with pytest.raises(ValueError, match=r"outside an image of shape \(100, 100\)"):
+        replace(cloud, shape=(100, 100))
+    for shape in ((0, 100), (-1, 5), (10.0, 10), (10, 10, 10)):
+        with pytest.raises(ValueError, match=r"must be \(rows, columns\)"):
+            replace(cloud, shape=shape)

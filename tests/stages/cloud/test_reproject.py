@@ -34,9 +34,11 @@ def test_triangulation_kernel_equals_the_reference():
     source = random.integers(0, 4, pixels.shape).astype(np.uint8)
     confidence = random.uniform(-0.1, 1.1, pixels.shape).astype(np.float32)
     confidence[0, 5] = np.nan
-    disparity, colours = Disparity(0, pixels, source, confidence), random.integers(0, 256, (12, 16, 3), np.uint8)
-    for image, filled, spacing in product((colours, colours[..., 0].copy()), (False, True), (0.0, 0.04)):
-        arguments = (disparity, image, SMALL, 8.0, filled, spacing)
+    own = np.where(random.random(pixels.shape) < 0.5, np.float32(0.2), np.float32(np.nan))
+    colours = random.integers(0, 256, (12, 16, 3), np.uint8)
+    variants = product((colours, colours[..., 0].copy()), (False, True), (0.0, 0.04), (None, own))
+    for image, filled, spacing, sigma in variants:
+        arguments = (Disparity(0, pixels, source, confidence, sigma=sigma), image, SMALL, 8.0, filled, spacing)
         for got, want in zip(triangulate(*arguments), triangulate_reference(*arguments), strict=True):
             assert got.dtype == want.dtype
             np.testing.assert_allclose(got, want, rtol=1e-6)
@@ -45,7 +47,7 @@ def test_triangulation_kernel_equals_the_reference():
 def test_filled_pixels_become_points_on_request_and_planes_always():
     codes = PixelOrigin.MEASURED, PixelOrigin.PLANE, PixelOrigin.FILLED, PixelOrigin.UNKNOWN
     frame = blank_frame(StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 4, 1))
-    disparity = disparity_of(np.full((1, 4), 5), codes)
+    disparity = disparity_of(np.full((1, 4), 5), codes, stamp=7)
     assert Reproject()(frame, disparity).pixel.tolist() == [0, 1]
     cloud = Reproject(include_filled=True)(frame, disparity)
     assert cloud.pixel.tolist() == [0, 1, 2]
@@ -63,9 +65,16 @@ def test_depth_sigma_predicts_the_scatter_of_noisy_disparities():
 
 def test_depth_sigma_grows_geometrically_as_confidence_falls():
     camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 5, 1)
-    disparity = disparity_of(np.full((1, 5), 5), confidence=np.linspace(1, 0, 5))
+    disparity = disparity_of(np.full((1, 5), 5), confidence=np.linspace(1, 0, 5), stamp=7)
     sigma = Reproject()(blank_frame(camera), disparity).sigma
     assert sigma / sigma[0] == pytest.approx((SIGMA_WORST / SIGMA_BEST) ** np.linspace(0, 1, 5), rel=1e-5)
+
+
+def test_a_match_without_its_own_sigma_gets_that_of_its_confidence():
+    camera = StereoCamera(100.0, 100.0, 2.0, 0.5, 0.2, 2, 1)
+    own, disparity = np.float32([[0.3, np.nan]]), disparity_of([[5, 5]], stamp=7)
+    sigma = [Reproject()(blank_frame(camera), each).sigma for each in (replace(disparity, sigma=own), disparity)]
+    assert sigma[0] == pytest.approx([0.3 * 5**2 / 25 * 0.8, sigma[1][1]], rel=1e-5)
 
 
 def test_points_beyond_max_depth_are_left_out_and_a_cloud_may_be_empty():
@@ -88,12 +97,20 @@ def test_near_points_are_thinned_as_far_as_their_spacing_allows():
     assert (np.isin(every.pixel, some.pixel) == kept).mean() > 0.9999
 
 
+@pytest.mark.parametrize(("fx", "fy", "rows"), [(400.0, 100.0, 1), (100.0, 400.0, 4)])
+def test_rows_of_pixels_that_are_not_square_are_thinned_by_their_own_spacing(fx, fy, rows):
+    camera = StereoCamera(fx, fy, 20.0, 15.0, 0.2, 40, 30)
+    disparity = disparity_of(np.full((30, 40), fx * camera.baseline / 4.0), stamp=7)  # 4 m away
+    cloud = Reproject(max_spacing=0.05)(blank_frame(camera), disparity)
+    assert np.diff(np.unique(cloud.pixel // 40)).tolist() == [rows] * (29 // rows)
+
+
 def test_colours_come_from_the_left_image():
     left, right = np.random.default_rng(3).integers(0, 256, (2, 12, 16, 3), np.uint8)
     disparity = as_disparity(np.full((12, 16), 5.0), SMALL)
-    cloud = Reproject()(StereoFrame(0, left, right, SMALL), disparity)
+    cloud = Reproject()(StereoFrame(7, left, right, SMALL), disparity)
     np.testing.assert_array_equal(cloud.colors, left.reshape(-1, 3))
-    gray = Reproject()(StereoFrame(0, left[..., 0], right[..., 0], SMALL), disparity)
+    gray = Reproject()(StereoFrame(7, left[..., 0], right[..., 0], SMALL), disparity)
     np.testing.assert_array_equal(gray.colors, np.repeat(left[..., 0].reshape(-1, 1), 3, axis=1))
 
 
@@ -102,7 +119,7 @@ def test_deep_images_give_the_colours_of_their_eight_bit_twin(bits):
     camera = StereoCamera(100.0, 100.0, 32.0, 24.0, 0.2, 64, 48)
     eight = np.random.default_rng(4).integers(0, 256, (48, 64, 3)).astype(np.uint8)
     deep = eight.astype(np.uint16) << (bits - 8)
-    cloud = Reproject()(StereoFrame(0, deep, deep, camera), as_disparity(np.full((48, 64), 5.0), camera))
+    cloud = Reproject()(StereoFrame(7, deep, deep, camera), as_disparity(np.full((48, 64), 5.0), camera))
     assert np.abs(cloud.colors.astype(int) - eight.reshape(-1, 3)).max() <= 2
 
 

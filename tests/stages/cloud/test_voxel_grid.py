@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from flow.contracts import StageError
 from stages.cloud.kernels.voxels import voxel_means, voxel_means_reference
 from stages.cloud.voxel_grid import VoxelGrid
 from stages.data import PixelOrigin
@@ -56,6 +57,11 @@ def test_a_map_of_too_many_voxels_is_refused():
     corners = cloud_of([[9.902, 0, 0], [0, 9.902, 0], [0, -9.902, 0]])
     widest = VoxelGrid(resolution=0.005, max_range=10.0)(corners)
     assert widest.index.tolist() == [[0, -1981, 0], [1980, 0, 0], [0, 1980, 0]]
+
+
+def test_a_point_far_above_the_ground_is_refused():
+    with pytest.raises(StageError, match=r"a point is 1e\+06 m above or below the origin; the limit is 4000 voxels"):
+        VoxelGrid()(cloud_of([[1, 1, 0], [1, 1, -1e6]]))
 
 
 def test_no_points_make_no_voxels():

@@ -176,6 +176,13 @@ def test_poses_of_different_frames_are_not_interpolated(frames):
         first.interpolated(Pose(4, np.array([8.0, 0, 0]), QUATERNION, *frames), 1)
 
 
+def test_tilts_are_not_smoothed_beyond_the_samples_of_a_filter():
+    samples = [Tilt(stamp, [0, 0, 1.0], filtered=True) for stamp in range(3)]
+    for given, message in ((samples, "10 ns is after the last sample"), ([], "there are no samples")):
+        with pytest.raises(ValueError, match=message):
+            Tilt.smoothed(given, 10)
+
+
 @pytest.mark.parametrize("shape", [(0,), (0, 3), (9,), (9, 3), (9, 1)])
 @pytest.mark.parametrize("dtype", [np.float32, np.uint8])
 def test_rows_are_those_that_numpy_indexes(shape, dtype):

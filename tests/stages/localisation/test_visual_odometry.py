@@ -84,7 +84,7 @@ def test_a_rover_that_stands_still_does_not_drift(drive):
     frame, disparity = drive[0]
     lefts = np.clip(frame.left + np.random.default_rng(0).integers(-3, 4, (8, *frame.left.shape)), 0, 255)
     seen = [replace(frame, stamp=frame.stamp + count, left=left.astype(np.uint8)) for count, left in enumerate(lefts)]
-    _, (*_, last) = tracked(*((each, disparity) for each in seen))
+    _, (*_, last) = tracked(*((each, replace(disparity, stamp=each.stamp)) for each in seen))
     assert np.linalg.norm(last.camera.translation) < 0.004
     assert np.degrees(Rotation.from_matrix(last.camera.rotation).magnitude()) < 0.05
 

@@ -47,6 +47,10 @@ def test_planes_replace_noise_and_outliers():
     assert (refined.source[near] == PixelOrigin.MEASURED).all()
 
 
+def test_a_stamp_before_1970_is_one_as_any_other():
+    assert np.isfinite(RefinePaper()(*scene(stamp=-1)).pixels).any()
+
+
 def test_a_superpixel_with_few_matches_gets_no_plane():
     bare = RefinePaper(superpixels=1000, median_size=0, bilateral_radius=0)  # of 11 px
     known = np.isfinite(MATCHES.pixels)

@@ -116,6 +116,20 @@ def test_a_match_of_little_confidence_counts_as_unknown():
     assert np.array_equal(np.isnan(strict.pixels), doubtful)
 
 
+def test_matches_with_their_own_sigma_are_refined_as_others_are():
+    empty = np.where(np.arange(HEIGHT)[:, None] < 20, np.float32(np.nan), MATCHES.pixels)  # rows of sky
+    matches = disparity_of(empty, confidence=MATCHES.confidence, stamp=5, camera=CAMERA)
+    sigma = np.where(np.isfinite(empty), np.float32(0.25), np.float32(np.nan))
+    one, other = (Refine()(FRAME, each) for each in (matches, replace(matches, sigma=sigma)))
+    assert one.pixels.tobytes() == other.pixels.tobytes()
+    assert one.segments.tobytes() == other.segments.tobytes()
+
+
+def test_matches_without_a_confidence_are_refused():
+    with pytest.raises(ValueError, match="the confidence of matched pixels is NaN; a result log does not keep it"):
+        Refine()(FRAME, replace(MATCHES, confidence=np.full(SHAPE, np.nan, np.float32)))
+
+
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("bad", [np.inf, -np.inf, 1e30, -1e7])
 def test_a_disparity_beyond_the_image_is_no_match(bad):

@@ -60,6 +60,13 @@ def test_every_rock_on_any_ground_is_found_with_few_false_alarms(ground):
     assert alarms <= 0.002
 
 
+def test_a_ceiling_without_the_layer_occluded_makes_no_drop():
+    heights, ceiling = np.float32(LEVEL), np.float32(LEVEL)
+    heights[30:40] = np.nan
+    elevation = replace(map_of(LEVEL), layers={"elevation": heights, "ceiling": ceiling})
+    assert (decided(elevation).cells[30:40] == Cell.UNKNOWN).all()
+
+
 def test_a_map_without_cells_stays_one():
     assert decided(map_of(np.zeros((0, 5)))).cells.shape == (0, 5)
 

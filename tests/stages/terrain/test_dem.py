@@ -65,6 +65,14 @@ def test_the_order_of_points_changes_at_most_the_last_bits():
         np.testing.assert_allclose(other[name], layer, rtol=1e-6)
 
 
+def test_hidden_cells_do_not_depend_on_the_order_of_the_points():
+    cloud = Level()(Clean()(Reproject()(FRAME, as_disparity(rocks_seen()))), TILT)
+    one, other = (Voxelise()(some).layers for some in (cloud, cloud.only(np.arange(len(cloud.pixel))[::-1].copy())))
+    assert (one["occluded"] == 1).any()
+    for name, layer in one.items():
+        assert layer.tobytes() == other[name].tobytes()
+
+
 def test_the_layers_of_one_cell_are_those_of_its_points():
     heights = np.array([0.1, 0.2, 0.6])
     points = np.column_stack([np.full(3, 2.01), np.full(3, -1.02), heights])
