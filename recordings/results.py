@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
@@ -83,19 +83,27 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
         raise LogError(f"{path} has no stream '{name}', only {', '.join(known)}")
     chosen = {known[name] for name in streams or known}
     read = chosen.union(*(parts[topic] for topic in chosen))
+    if any(schemas[topic] == _GRID_MAP for topic in chosen):
+        read |= {"/tf", "/nav/diagnostics"}
     for stamp, group in groupby(iter_decoded(path, sorted(read)), key=lambda item: item[1]):
-        messages = {topic: message for topic, _, message in group}
-        yield ResultFrame(stamp, dict(_items(messages, chosen, schemas)))
+        messages = [(topic, message) for topic, _, message in group]
+        if items := dict(_items(messages, stamp, chosen, schemas)):
+            yield ResultFrame(stamp, items)
 
 
 def _items(
-    messages: Mapping[str, Any], chosen: Collection[str], schemas: Mapping[str, str]
+    messages: Sequence[tuple[str, Any]], stamp: int, chosen: Collection[str], schemas: Mapping[str, str]
 ) -> Iterator[tuple[str, Any]]:
     """(Stream, item) of the messages of a stamp."""
-    for topic in sorted(messages.keys() & set(chosen)):
+    by_topic = dict(messages)
+    for topic in sorted(by_topic.keys() & set(chosen)):
         schema = schemas[topic]
-        parts = (messages.get(f"{topic}/{part}") for part in _PARTS.get(schema, ()))
-        yield topic.removeprefix("/nav/"), _READERS[schema](messages[topic], *parts)
+        if schema == _GRID_MAP:
+            item: Any = ros2.read_regional_map(messages, topic, stamp)
+        else:
+            parts = (by_topic.get(f"{topic}/{part}") for part in _PARTS.get(schema, ()))
+            item = _READERS[schema](by_topic[topic], *parts)
+        yield topic.removeprefix("/nav/"), item
 
 
 def _disparity(message: Any, origins: Any, info: Any) -> Disparity:
@@ -109,12 +117,13 @@ def _disparity(message: Any, origins: Any, info: Any) -> Disparity:
     return Disparity(ros2.stamp_of(message.header), pixels, source, unstated, camera=camera)
 
 
+_GRID_MAP = "grid_map_msgs/msg/GridMap"
 # Schema -> the ends of further topics, whose messages its reader gets with the message
 _PARTS = {"stereo_msgs/msg/DisparityImage": ("source", "camera_info"), "nav_msgs/msg/OccupancyGrid": ("reason",)}
 _READERS: dict[str, Callable[..., Any]] = {
     "stereo_msgs/msg/DisparityImage": _disparity,
     "nav_msgs/msg/OccupancyGrid": ros2.read_occupancy_grid,
-    "grid_map_msgs/msg/GridMap": ros2.read_grid_map,
+    _GRID_MAP: ros2.read_grid_map,
     "nav_msgs/msg/Odometry": lambda message: ros2.pose_of(message, 0, "base_link"),
     "sensor_msgs/msg/PointCloud2": ros2.read_point_cloud,
     **dict.fromkeys(

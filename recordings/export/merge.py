@@ -19,8 +19,10 @@ import numpy as np
 
 from recordings.atomic_write import written
 from recordings.errors import LogError
-from recordings.export.bundle import REGIONAL, MapFiles, regions_of
+from recordings.export.bundle import regions_of
+from recordings.export.map_files import REGIONAL, MapFiles
 from recordings.export.mosaic import Mosaic
+from recordings.scoring.result_log import about_run
 from stages.data import TILE_SIDE, Array, Cell, ElevationMap
 
 MAX_SIGMAS = 3.0  # between two heights of a cell
@@ -124,12 +126,16 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
     cell is a hazard if it is one in any log, and free if it is free in a log and not in conflict.
 
     results: logs that runs wrote, with poses in one frame of reference; lost: if given, damaged logs are merged as far
-    as they are readable, and the reasons of losses are counted here. Raises LogError if a log has no regional map with
-    variances, or the maps differ in frame or cell size.
+    as they are readable, and the reasons of losses are counted here, with the file. Raises LogError if a log has no
+    regional map with variances, the maps differ in frame or cell size, or two results are of the same input.
     """
+    _check_inputs(results)
     regions, stamp, grid = list[dict[tuple[int, int], Array]](), 0, None
     for result in results:
-        terrain, tiles, last = _region(result, lost)
+        own = Counter[str]() if lost is not None else None
+        terrain, tiles, last = _region(result, own)
+        if lost is not None and own is not None:
+            lost.update({f"{result}: {why}": times for why, times in own.items()})
         grid = grid or (terrain.frame_id, terrain.resolution)
         if (terrain.frame_id, terrain.resolution) != grid:
             raise LogError(
@@ -144,7 +150,7 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
     merged = Merged(list(results), *grid, cells)
     terrain = Mosaic(grid[1], grid[0], dict.fromkeys(LAYERS, np.float32(np.nan)), 0.0)
     navigation = Mosaic(grid[1], grid[0], {"cells": np.int8(Cell.UNKNOWN)}, 0.0)
-    files = MapFiles(0.0, terrain, navigation, stamp=stamp)
+    files = MapFiles(0.0, elevation=terrain, navigation=navigation, stamp=stamp)
     for index in sorted(set().union(*regions)):
         parts = {number: region[index] for number, region in enumerate(regions, 1) if index in region}
         _add_tile(files, index, parts, merged)
@@ -154,6 +160,19 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
         temporary.write_text(json.dumps(merged.as_json(), indent=2))
     merged.files.append(path)
     return merged
+
+
+def _check_inputs(results: Sequence[Path]) -> None:
+    """Raise LogError for two results of the same part of the same input, which would count as independent."""
+    known: dict[Any, Path] = {}
+    for result in results:
+        about = about_run(result)
+        part = about.get("log_digest") or result.resolve(), about.get("start"), about.get("end")
+        if part in known:
+            raise LogError(
+                f"{known[part]} and {result} are results of the same input, which would count twice; give one of them"
+            )
+        known[part] = result
 
 
 def merged_cells(elevation: Array, variance: Array) -> tuple[Array, Array]:
@@ -203,7 +222,7 @@ def _region(result: Path, lost: Counter[str] | None) -> tuple[Mosaic, dict[tuple
     regions = regions_of(result, lost, REGIONAL, colored=False)
     if len(regions) > 1:
         names = ", ".join(regions)
-        raise LogError(f"the regional map of {result} was reset (frames {names}); merging needs a map in one frame")
+        raise LogError(f"the regional map of {result} was reset (parts {names}); merging needs a map in one part")
     (region,) = regions.values()
     terrain = region.elevation
     if terrain is None or "variance" not in terrain.fills:

@@ -77,12 +77,23 @@ def write_cells(path: Path, terrain: Mosaic, colors: Tiles, about: str) -> None:
             if has_sigma:
                 vertices["sigma"] = np.sqrt(terrain.block("variance", low, 0, count, cols)[known])
             if colored:
-                rgb = colors.read(first_row + low, first_col, count, cols)["rgb"][known]
+                cells = colors.read(first_row + low, first_col, count, cols)
+                rgb = _nearest_colors(cells["rgb"], cells["seen"] > 0)[known]
                 for place, (name, _) in enumerate(COLORS):
                     vertices[name] = rgb[:, place]
             yield vertices
 
     write_ply(path, dtype, parts(), about)
+
+
+def _nearest_colors(rgb: Array, seen: Array) -> Array:
+    """The colours (rows, cols, 3) with those of the nearest cell that a coloured point lies in; gray without any."""
+    from scipy.ndimage import distance_transform_edt  # takes long to import
+
+    if not seen.any():
+        return np.full_like(rgb, 127)
+    row, col = distance_transform_edt(~seen, return_distances=False, return_indices=True)
+    return np.asarray(rgb[row, col])
 
 
 def write_ply(path: Path, dtype: np.dtype[np.void], parts: Iterable[Array], comment: str) -> None:

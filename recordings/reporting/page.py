@@ -14,7 +14,7 @@ from recordings.atomic_write import written
 from recordings.comparison.diff import diff
 from recordings.comparison.text import format_diff, moment
 from recordings.errors import LogError
-from recordings.export.bundle import MapFiles
+from recordings.export.map_files import MapFiles
 from recordings.export.page_layout import Page
 from recordings.export.png_pages import PAGES, elevation_page, navigation_page
 from recordings.reporting.figures import MAX_WIDTH, line_plot, picture, track_plot
@@ -27,8 +27,8 @@ MAX_REGIONS = 6  # frames of reference whose maps are drawn
 STYLE = Path(__file__).with_name("style.css")
 
 
-def write_report(path: Path, results: Sequence[Path]) -> None:
-    """Write the page of one result log, or of two beside each other.
+def write_report(path: Path, results: Sequence[Path]) -> list[str]:
+    """Write the page of one result log, or of two beside each other; returns what of them cannot be read.
 
     Raises LogError if a file is not a result log or cannot be read, and UnwritableError if the page cannot be written.
     """
@@ -45,6 +45,7 @@ def write_report(path: Path, results: Sequence[Path]) -> None:
         _section("Parameters", _beside([_parameters(found) for found in facts])),
     ]
     write_page(path, " and ".join(names), parts)
+    return [f"{found.path}: {why}" for found in facts for why in found.unreadable]
 
 
 def _names(results: Sequence[Path]) -> list[str]:
@@ -88,11 +89,12 @@ def _verdict(facts: RunFacts) -> str:
     verdict = facts.counts.get("verdict", "the log is truncated before its verdict")
     drops = {name.removeprefix("drops."): value for name, value in facts.counts.items() if name.startswith("drops.")}
     findings = [(name.removeprefix("findings."), value) for name, value in facts.counts.items() if "findings." in name]
+    none = "none" if facts.counts else "unknown"
     rows = [
         ("log", facts.about.get("log", "")),
         ("pipeline", facts.counts.get("pipeline", "")),
         ("frames", f"{facts.counts.get('frames_out', '?')} of {facts.counts.get('frames_in', '?')} complete"),
-        ("losses", ", ".join(f"{number} {reason}" for reason, number in drops.items()) or "none"),
+        ("losses", ", ".join(f"{number} {reason}" for reason, number in drops.items()) or none),
         *findings,
         *(("unreadable", reason) for reason in facts.unreadable),
         ("version", facts.about.get("roverflow", "")),

@@ -5,19 +5,20 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from recordings.export.bundle import REGIONAL, MapFiles
+from recordings.export.map_files import DIAGNOSTICS, REGIONAL, MapFiles, part_with
 from recordings.export.png_pages import PAGES
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
 from recordings.scoring.result_log import check_profile, end_of_run, facts_of
-from stages.data import RIM_WIDTH, Cell
+from stages.data import Cell
 
-TOPICS = (*PAGES, "/nav/pose", "/nav/diagnostics", *filter(None, REGIONAL))
+TOPICS = (*PAGES, "/nav/pose", DIAGNOSTICS, *filter(None, REGIONAL))
 
 
 @dataclass
@@ -27,7 +28,7 @@ class RunFacts:
     about, counts: facts of the run, and its verdict, counts and findings; unreadable: reason -> number of messages;
     stamps: of the frames, ns; series: name with unit -> stamp -> value; tracks: frame of reference -> (x, y) of the
     rover, m; losses: (stream, stamp, reason, detail); drawn: name -> stamp and messages by topic, of the frames that
-    are drawn; regional: frame of reference -> the regional maps in it.
+    are drawn; regional: name -> each part of the regional map.
     """
 
     path: Path
@@ -51,8 +52,16 @@ def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) 
     about = facts_of(path, "a log that roverflow run wrote")
     check_profile(path, about)
     facts = RunFacts(path, about, end_of_run(path))
-    for topic, stamp, message in iter_decoded(path, TOPICS, facts.unreadable):
-        _add(facts, topic, stamp, message)
+    for stamp, group in groupby(iter_decoded(path, TOPICS, facts.unreadable), key=lambda item: item[1]):
+        messages: dict[str, Any] = {DIAGNOSTICS: []}
+        for topic, _, message in group:
+            _add(facts, topic, stamp, message)
+            if topic == DIAGNOSTICS:
+                messages[topic] += message.status
+            elif topic in REGIONAL:
+                messages[topic] = message
+        if part := part_with(facts.regional, REGIONAL, messages, wanted=("elevation",)):
+            part.add(path, REGIONAL, stamp, messages)
     facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
     chosen = {name: stamp for name, (stamp, _) in (beside or {}).items()}
     if not chosen or not set(chosen.values()) <= set(facts.stamps):
@@ -78,14 +87,11 @@ def _add(facts: RunFacts, topic: str, stamp: int, message: Any) -> None:
     elif topic == "/nav/pose":
         place = message.pose.pose.position
         facts.tracks.setdefault(message.header.frame_id, []).append((place.x, place.y))
-    elif topic == "/nav/diagnostics":
+    elif topic == DIAGNOSTICS:
         for status in message.status:
             found = {pair.key: pair.value for pair in status.values}
             if "reason" in found:
                 facts.losses.append((found["stream"], found["stamp"], found["reason"], status.message))
-    elif topic in REGIONAL:
-        maps = facts.regional.setdefault(message.header.frame_id, MapFiles(RIM_WIDTH, wanted=("elevation",)))
-        maps.add(facts.path, REGIONAL, stamp, {topic: message})
     for name, value in values.items():
         facts.series.setdefault(name, {})[stamp] = value
 

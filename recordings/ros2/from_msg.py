@@ -6,6 +6,9 @@ The functions raise LogError for a message with invalid content.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,7 +17,7 @@ from numpy.typing import NDArray
 from recordings.errors import LogError
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.to_msg import FLOAT32
-from stages.data import Array, CameraModel, Cell, CellReason, ElevationMap, NavigationMap, Pose, Transform
+from stages.data import LEVEL_FRAME, Array, CameraModel, Cell, CellReason, ElevationMap, NavigationMap, Pose, Transform
 from stages.data.rotations import matrix_of, unit
 
 REASON_NOT_RECORDED = 255  # of a hazard in an OccupancyGrid without its `reason_map`
@@ -154,6 +157,34 @@ def read_grid_map(message: Any) -> ElevationMap:
         stamp_of(message.header), read_layers(message), float(info.resolution),
         (centre.x - info.length_x / 2, centre.y - info.length_y / 2), message.header.frame_id,
     )  # fmt: skip
+
+
+def read_regional_map(messages: Sequence[tuple[str, Any]], topic: str, stamp: int) -> ElevationMap:
+    """A regional map among the messages of a stamp, with its epoch, and with frame `level` if it is of that stamp.
+
+    messages: topic and message; /tf may have several.
+    """
+    terrain = read_grid_map(dict(messages)[topic])
+    level = level_in((message for _, message in messages), terrain.frame_id) if terrain.stamp == stamp else None
+    statuses = chain.from_iterable(getattr(message, "status", ()) for _, message in messages)
+    return replace(terrain, level=level, epoch=epoch_of(statuses, topic))
+
+
+def epoch_of(statuses: Iterable[Any], topic: str | None) -> int | None:
+    """The epoch, ns, of the map of a topic, by the diagnostics of its stamp; None if they do not contain it."""
+    for status in statuses:
+        for pair in status.values if f"/nav/{status.name}" == topic else ():
+            if pair.key == "epoch":
+                return int(pair.value)
+    return None
+
+
+def level_in(messages: Iterable[Any], parent: str) -> Transform | None:
+    """Frame `level` in a frame of reference, by the messages of a stamp: /tf may have several."""
+    for item in chain.from_iterable(getattr(message, "transforms", ()) for message in messages):
+        if item.child_frame_id == LEVEL_FRAME and item.header.frame_id == parent:
+            return transform_of(item)
+    return None
 
 
 def read_layers(message: Any) -> dict[str, Array]:

@@ -157,7 +157,7 @@ class McapSink:
         writer, stamp = self._writer, record.stamp
         kept = {name: record.items[name] for name in self._written if name in record.items}
         self._write_items(kept, stamp)
-        own = {(known.parent, known.child): known for known in _transforms(record.items.values())}
+        own = {(known.parent, known.child): known for known in _transforms(record.items.values(), stamp)}
         regional = any(plain_type(kind) is Region for kind in self._kinds.values())
         if transforms := beside_inputs([*own.values()], self._theirs, regional):
             writer.write("/tf", transform_message((known, stamp) for known in transforms), stamp)
@@ -286,9 +286,11 @@ def _topic_part(name: str) -> str:
     return re.sub(r"^(?=\d|$)", "_", re.sub(r"[^A-Za-z0-9_]", "_", name))
 
 
-def _transforms(items: Iterable[Any]) -> Iterator[Transform]:
-    """The poses of the sensors of clouds, and of frame `level` in regions and in maps."""
+def _transforms(items: Iterable[Any], stamp: int) -> Iterator[Transform]:
+    """The poses of the sensors of clouds, and of frame `level` in regions and in maps, of a stamp."""
     for item in items:
+        if getattr(item, "stamp", stamp) != stamp:  # the map of an earlier frame, where the region begins again
+            continue
         known = item.sensor if isinstance(item, PointCloud) else getattr(item, "level", None)
         if isinstance(known, Transform):  # a type of the user's own may have another `level`
             yield known

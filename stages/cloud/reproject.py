@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from stages.cloud.kernels.triangulation import triangulate
 from stages.data import Disparity, PointCloud, StereoFrame
 from stages.matching.intensity import eight_bit
-from stages.stage import Stage, check_confidence, check_joined, check_same_time, parameter
+from stages.stage import Stage, check_joined, check_same_time, parameter
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,6 @@ class Reproject(Stage):
         """The cloud of `disparity`, with the colours of the left image in 8 bit; it may be empty."""
         check_joined(self, frame, disparity)
         check_same_time(self, frame=frame.stamp, disparity=disparity.stamp)
-        if disparity.sigma is None:
-            check_confidence(self, disparity)
         camera = disparity.camera or frame.camera
         colors = eight_bit(frame.left)[0]
         points, rgb, sigma, pixel = triangulate(

@@ -92,13 +92,14 @@ def test_a_report_shows_all_ground_of_the_run_in_each_frame_of_reference(tmp_pat
     assert "1 smaller map in other frames of reference" in text
 
 
-def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path):
+def test_the_report_of_a_result_that_was_cut_says_so(result, tmp_path, said):
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(result.read_bytes()[: result.stat().st_size // 2])
-    assert roverflow("report", cut) == 0
+    assert f"WARNING: {cut}: the log is truncated or damaged at byte" in said(3, "report", cut).out
     text = " ".join(Page(cut.with_suffix(".html").read_text()).words)
     assert "the log is truncated before its verdict" in text
     assert "No loss is recorded before the log ends." in text
+    assert "losses unknown" in text
     assert re.search(r"unreadable the log is truncated or damaged at byte \d+", text)
 
 

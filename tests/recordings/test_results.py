@@ -20,6 +20,9 @@ def test_each_stream_is_read_as_its_type(result):
              "regional_map": ElevationMap, "regional_navigation_map": NavigationMap, "points": dict}  # fmt: skip
     assert {name: type(items[name]) for name in kinds} == kinds
     assert all(item.stamp == frames[-1].stamp for item in items.values() if not isinstance(item, dict))
+    region, pose = items["regional_map"], items["pose"]
+    assert region.epoch == frames[0].stamp
+    assert np.hypot(*(region.level.translation - pose.position)[:2]) < 0.02
 
 
 def test_disparities_have_their_origins_and_maps_their_reasons(result):

@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> int:
     size = sum(file.stat().st_size for file in files)
     say(f"{options.folder}: {counted(len(files), 'file')} ({size / 1e6:.1f} MB)")
     for why in lost:
-        say(f"WARNING: {results[0] if len(results) == 1 else 'merge'}: {why}; the rest was exported")
+        say(f"WARNING: {why if options.merge else f'{results[0]}: {why}'}; the rest was exported")
     return INCOMPLETE if lost or faults else COMPLETE
 
 

@@ -7,21 +7,20 @@ the map lies, and visual odometry continues from its pose. The frames after it a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flow.cli.debugging.regional_explanation import level_in
 from flow.cli.debugging.result_input import check_input
 from flow.cli.debugging.variants import Variants, sink_of
 from flow.errors import UsageError
 from flow.runtime.graph import Graph, Node
 from recordings.comparison.text import moment
 from recordings.mcap.file import McapFile, iter_decoded
-from recordings.ros2.from_msg import pose_of, read_grid_map
+from recordings.ros2.from_msg import pose_of, read_regional_map
 from recordings.scoring.result_log import about_run, check_profile
 from stages import Fuse, FuseRegion, MapRegion, PoseFilter, VisualOdometry
 from stages.data import ElevationMap, Pose
@@ -129,7 +128,7 @@ def logged_state(result: Path, graph: Graph, before: int) -> LoggedState | None:
         of_stamp = [(topic, message) for topic, _, message in group]
         messages = dict(of_stamp)
         for topic in messages.keys() & map_topics.keys():
-            maps[map_topics[topic]].append(_regional(of_stamp, topic, stamp))
+            maps[map_topics[topic]].append(read_regional_map(of_stamp, topic, stamp))
         found = (pose_of(messages[topic], stamp, "") for topic in messages.keys() & pose_topics)
         poses += [pose for pose in found if pose is not None and segment_of(pose.frame_id) is not None]
     ends = [{part.stamp for part in parts if part.level is not None} for parts in maps.values()]
@@ -157,12 +156,3 @@ def _topics(result: Path, graph: Graph) -> tuple[dict[str, str], set[str]]:
             maps |= dict.fromkeys(topics[:1], node.name)
     poses = {f"/nav/{node.name}" for node in graph.stages if isinstance(node.actor, PoseFilter)}
     return maps, poses & schemas.keys()
-
-
-def _regional(of_stamp: Sequence[tuple[str, Any]], topic: str, stamp: int) -> ElevationMap:
-    """A regional map among the messages of a stamp, with its epoch, and with frame `level` if it is of that stamp."""
-    terrain, messages = read_grid_map(dict(of_stamp)[topic]), [message for _, message in of_stamp]
-    level = level_in(messages, terrain.frame_id) if terrain.stamp == stamp else None
-    statuses = [status for message in messages for status in getattr(message, "status", ())]
-    values = {item.key: item.value for status in statuses for item in status.values if f"/nav/{status.name}" == topic}
-    return replace(terrain, level=level, epoch=int(values["epoch"]) if "epoch" in values else None)

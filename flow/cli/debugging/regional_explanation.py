@@ -5,9 +5,9 @@ Everything is in the result log, so nothing runs again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, groupby
+from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,10 +20,10 @@ from flow.errors import UsageError
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
-from recordings.ros2.from_msg import read_point_cloud, transform_of
+from recordings.ros2.from_msg import level_in, read_point_cloud
 from recordings.scoring.result_log import stamps_of
 from stages import Binarise
-from stages.data import LEVEL_FRAME, Array, ElevationMap, NavigationMap, Transform
+from stages.data import Array, ElevationMap, NavigationMap, Transform
 
 
 class Contribution(NamedTuple):
@@ -147,14 +147,6 @@ def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float,
         if heights.size:
             found.append(Contribution(stamp, len(heights), float(heights.mean())))
     return found
-
-
-def level_in(messages: Iterable[Any], parent: str) -> Transform | None:
-    """Frame `level` in the map's frame, by the messages of a stamp: /tf may have several."""
-    for item in chain.from_iterable(getattr(message, "transforms", ()) for message in messages):
-        if item.child_frame_id == LEVEL_FRAME and item.header.frame_id == parent:
-            return transform_of(item)
-    return None
 
 
 def _heights(fields: Mapping[str, Array], level: Transform, centre: tuple[float, float], resolution: float) -> Array:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from flow.cli.outputs import check_outputs
 from flow.cli.report import say
-from flow.errors import COMPLETE, UsageError
+from flow.errors import COMPLETE, INCOMPLETE, UsageError
 
 HELP = "write one HTML page about a result log, about two side by side, or about a fleet"
 
@@ -34,6 +34,8 @@ def run(options: argparse.Namespace) -> int:
         return COMPLETE
     from recordings.reporting.page import write_report
 
-    write_report(out, options.results)
+    unreadable = write_report(out, options.results)
     say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
-    return COMPLETE
+    for why in unreadable:
+        say(f"WARNING: {why}; the page shows the rest")
+    return INCOMPLETE if unreadable else COMPLETE

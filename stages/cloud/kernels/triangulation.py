@@ -18,6 +18,7 @@ COLUMN_SPACING = 2  # of columns over that of rows: ground ahead is foreshortene
 # Standard deviations of disparities, px. Of a match without its own it rises geometrically from confidence 1 to 0.
 SIGMA_BEST, SIGMA_WORST = 0.086, 42.0
 SIGMA_PLANE, SIGMA_FILLED = 0.75, 3.0  # of the origins PLANE and FILLED
+SIGMA_UNSTATED = 0.6  # of a match without confidence, as in a result log: Refine calls none measured that is less sure
 _LOG_BEST, _LOG_WORST = float(np.log(SIGMA_BEST)), float(np.log(SIGMA_WORST))
 
 
@@ -101,8 +102,10 @@ def _triangulate(disparity, source, confidence, colors, camera, max_depth, fille
                 sigma_d = SIGMA_PLANE
             elif own.size and not np.isnan(own[row, col]):
                 sigma_d = np.float64(own[row, col])
+            elif np.isnan(confidence[row, col]):
+                sigma_d = SIGMA_UNSTATED
             else:
-                trust = min(np.float64(confidence[row, col]), 1.0) if confidence[row, col] > 0.0 else 0.0
+                trust = min(max(np.float64(confidence[row, col]), 0.0), 1.0)
                 sigma_d = np.exp(_LOG_WORST + (_LOG_BEST - _LOG_WORST) * trust)
             sigma[n] = z * z / focal_baseline * sigma_d
             pixel[n] = row * width + col
@@ -129,8 +132,8 @@ def triangulate_reference(
     z = camera.fx * camera.baseline / effective[v, u]
     points = np.column_stack([(u - camera.cx) * z / camera.fx, (v - camera.cy) * z / camera.fy, z])
     rgb = colors[v, u] if colors.ndim == 3 else np.repeat(colors[v, u][:, None], 3, axis=1)
-    trust = np.clip(np.nan_to_num(confidence[v, u].astype(np.float64)), 0, 1)
-    sigma_d = SIGMA_WORST * (SIGMA_BEST / SIGMA_WORST) ** trust
+    trust = np.clip(confidence[v, u].astype(np.float64), 0, 1)
+    sigma_d = np.where(np.isnan(trust), SIGMA_UNSTATED, SIGMA_WORST * (SIGMA_BEST / SIGMA_WORST) ** trust)
     if disparity.sigma is not None:
         own = disparity.sigma[v, u].astype(np.float64)
         sigma_d = np.where(np.isnan(own), sigma_d, own)

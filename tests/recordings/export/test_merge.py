@@ -16,7 +16,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.simulator import Simulation, write_log
 from stages.data import Cell, ElevationMap, NavigationMap
-from tests.conftest import edit_of, rewrite, roverflow
+from tests.conftest import chunks_of, edit_of, rewrite, roverflow, with_broken
 
 STEP, SHAPE = 0.1, (50, 60)
 
@@ -30,6 +30,7 @@ def traverse(path: Path, first_col: int, height: float, variance: float, hazard_
     origin = (first_col * STEP, -2.0)
     with Ros2Writer(path) as writer:
         writer.write("/nav/regional_map", ros2.grid_map(ElevationMap(5, layers, STEP, origin, frame)), 5)
+        writer.flush()  # a broken second chunk leaves the heights
         navigation = NavigationMap(5, cells, np.zeros(SHAPE, np.uint8), STEP, origin, frame)
         writer.write("/nav/regional_navigation_map", ros2.occupancy_grid(navigation), 5)
     return path
@@ -79,11 +80,15 @@ def test_logs_that_differ_by_more_than_their_sigmas_are_reported(tmp_path, said)
     assert np.asarray(Image.open(tmp_path / "out/navigation_map.pgm"))[9, 50] == 205  # no longer free
 
 
-def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, refused):
+def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, refused, said):
     a = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, hazard_col=-1)
     other = traverse(tmp_path / "other.mcap", 0, 1.0, 4e-4, hazard_col=-1, frame="odom")
     with pytest.raises(LogError, match=r"other\.mcap has its map in 'odom' with cells of 0\.1 m, .*a\.mcap in 'map'"):
         merge([a, other], tmp_path / "out")
+    with pytest.raises(LogError, match=r"a\.mcap and .*a\.mcap are results of the same input, which would count twice"):
+        merge([a, tmp_path / "x" / ".." / "a.mcap"], tmp_path / "out")
+    broken = with_broken(a, chunks_of(a)[1][0])
+    assert f"WARNING: {broken}: the chunk at byte" in said(3, "export", a, broken, tmp_path / "m", "--merge").out
     assert "add --merge to merge the maps of several logs" in refused("export", a, other, tmp_path / "out")
     assert "has no catalogue.sqlite" in refused("export", tmp_path, tmp_path / "out", "--merge")
 

@@ -257,6 +257,20 @@ def test_frame_level_is_placed_in_frames_without_a_regional_map(tmp_path):
     assert moved == places
 
 
+def test_the_map_of_an_earlier_frame_does_not_place_frame_level(tmp_path):
+    """Where a region begins again, the map that the frame before lacked comes with the next frame."""
+    fuse, made = Fusing(), []
+    for frame in range(2):
+        cloud, pose = drive(frame)
+        made.append((fuse(cloud, pose, MOUNT), fuse.region))
+    (held, _), (_, region) = made
+    streams = {"regional_cells": Region, "regional_map": ElevationMap}
+    record = Record(region.stamp, {"regional_cells": region, "regional_map": held})
+    ((_, _, message),) = iter_decoded(logged(tmp_path / "out.mcap", record, streams=streams), ["/tf"])
+    (at,) = message.transforms
+    assert at.transform.translation.x == region.level.translation[0] != held.level.translation[0]
+
+
 def test_frame_level_has_one_parent_though_the_first_frame_has_no_pose(tmp_path):
     fuse, records = Fusing(), []
     for frame in range(3):
