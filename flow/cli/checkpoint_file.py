@@ -107,6 +107,18 @@ def only_run_of(result: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
+def is_being_written(result: Path) -> bool:
+    """Whether a run that may be resumed writes a result log just now, if the file system has locks."""
+    try:
+        with result.with_name(f"{result.name}.lock").open() as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # there is no lock
+        pass
+    return False
+
+
 def checkpoint_of(result: Path) -> Path:
     """The name of the checkpoint of a result log."""
     return result.with_name(f"{result.name}.checkpoint")

@@ -86,8 +86,7 @@ def _files_of(folder: Path) -> FoundFiles:
         inside = sorted(path.parent.name for path in folder.glob(f"*/{METADATA}"))
         hint = f"; its folders {_named(inside)} are recordings, give one" if inside else "; give a log or its folder"
         raise LogError(f"{folder} contains no recording (no {', '.join(SUFFIXES)} file){hint}")
-    groups = {_group(path) for path in present}
-    if len(groups) > 1:
+    if len(present) > 1 and not _is_split([path.name for path in present]):
         raise LogError(
             f"{folder} contains several recordings ({_named([path.name for path in present])}); give the files of one; "
             "roverflow fleet runs all"
@@ -110,9 +109,19 @@ def _listed(metadata: Path) -> list[str]:
         return []
 
 
+def is_log_name(name: str) -> bool:
+    """Whether a file of this name may be a log, compressed or not, by its ending."""
+    return name.lower().removesuffix(".zstd").removesuffix(".zst").endswith(SUFFIXES)
+
+
 def _is_recording(path: Path) -> bool:
-    name = path.name.removesuffix(".zstd").removesuffix(".zst")
-    return name.endswith(SUFFIXES) and not Path(name).stem.endswith(RESULT_ENDING) and path.is_file()
+    stem = path.name.removesuffix(".zstd").removesuffix(".zst")
+    return is_log_name(path.name) and not Path(stem).stem.endswith(RESULT_ENDING) and path.is_file()
+
+
+def _is_split(names: Sequence[str]) -> bool:
+    """Whether files, in their natural order, are NAME_0, NAME_1 and so on; some may be missing."""
+    return len(set(map(_group, names))) == 1 and re.search(r"_0+\.", names[0]) is not None
 
 
 def natural(name: str) -> list[Any]:
@@ -120,22 +129,22 @@ def natural(name: str) -> list[Any]:
     return [int(part) if place % 2 else part for place, part in enumerate(re.split(r"(\d+)", name))]
 
 
-def _group(path: Path) -> str:
-    """The name of a recording of several files without the number of the file."""
-    return re.sub(r"_\d+(?=\.)", "", path.name)
+def _group(name: str) -> str:
+    """The name of a file of a recording of several without the number of the file."""
+    return re.sub(r"_\d+(?=\.)", "", name)
 
 
 def _split_of(path: Path) -> str:
     """A sentence, if a file is one of several of a recording; else an empty string."""
-    siblings = [other for other in _neighbours(path) if _group(other) == _group(path) and _is_recording(other)]
+    group = _group(path.name)
+    siblings = [other for other in _neighbours(path) if _group(other.name) == group and _is_recording(other)]
     listed = _listed(path.with_name(METADATA))
     names = (
         listed
         if path.name in listed
         else [other.name for other in sorted(siblings, key=lambda path: natural(path.name))]
     )
-    starts_at_zero = re.search(r"_0\.", names[0]) if names else None
-    if len(names) < 2 or path.name not in names or not (path.name in listed or starts_at_zero):
+    if len(names) < 2 or path.name not in names or not (path.name in listed or _is_split(names)):
         return ""
     return (
         f"{path.name} is file {names.index(path.name) + 1} of {len(names)} of a recording ({names[0]} to {names[-1]}); "

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import time
@@ -20,7 +21,7 @@ from flow.cli.fleet.progress import Progress
 from flow.cli.fleet.task import Pipeline, Task, _columns, run_task, unfit
 from flow.errors import UsageError
 from recordings.simulator import Simulation, write_log
-from tests.conftest import roverflow
+from tests.conftest import chunks_of, roverflow, with_broken
 
 PIPELINE = ("-p", "fast", "--set", "disparities=48")
 TRAP = """
@@ -102,6 +103,39 @@ class Locked:
     def __call__(self, frame: StereoFrame, *, state) -> StereoFrame:
         return frame
 """
+
+
+@pytest.mark.parametrize("ending", ["json", "progress"])
+def test_a_task_replaces_no_file_of_others(logs, tmp_path, ending):
+    (job,) = (job for job in jobs_of([str(logs)], tmp_path) if job.name == "a")
+    task = Task(job, tmp_path, Pipeline.of("fast", ()), recording=False, workers=1)
+    (other := tmp_path / f"a-nav.{ending}").write_text('{"waypoints": [1, 2, 3]}')
+    row = run_task(task)
+    assert (row["state"], row["why"]) == (
+        "failed", f"{other} is not a file of a fleet; rename it, or choose another --out"
+    )  # fmt: skip
+    assert other.read_text() == '{"waypoints": [1, 2, 3]}'
+    assert not task.result.exists()
+
+
+def test_what_another_run_is_writing_stays(logs, tmp_path):
+    (job,) = (job for job in jobs_of([str(logs)], tmp_path) if job.name == "a")
+    task = Task(job, tmp_path, Pipeline.of("fast", ()), recording=False, workers=1)
+    (partial := tmp_path / "a-nav.mcap.1-0.partial").touch()
+    with checkpoint_file.only_run_of(task.result):
+        row = run_task(task)
+    assert (row["state"], row["why"].partition(" is being")[0]) == ("failed", str(task.result))
+    assert partial.exists()
+    assert run_task(task)["state"] == "done"
+    assert not partial.exists()
+
+
+def test_a_name_that_is_too_long_is_a_failure_of_its_log_alone(logs, tmp_path):
+    name = "L" * 240
+    job = replace(jobs_of([str(logs / "a.mcap")], tmp_path)[0], name=name)
+    row = run_task(Task(job, tmp_path, Pipeline.of("fast", ()), recording=False, workers=1))
+    assert row["state"] == "failed"
+    assert "-nav.mcap: File name too long" in row["why"]
 
 
 @pytest.mark.parametrize("locked", [False, True])
@@ -206,6 +240,10 @@ def test_a_watched_fleet_whose_process_is_gone_is_named(tmp_path, said):
     catalogue.put("a", {"state": "running", "bytes": 9})
     printed = said(3, "fleet", "--out", tmp_path, "--watch").out
     assert "no process runs this fleet, 1 log left; run its command again to continue" in printed
+    catalogue.put("a", {"state": "unusable"})
+    assert said(3, "fleet", "--out", tmp_path, "--watch").out.count("1 unusable;") == 1
+    catalogue.put("a", {"state": "done", "verdict": "COMPLETE"})
+    said(0, "fleet", "--out", tmp_path, "--watch")
 
 
 def test_a_worker_that_stays_forgets_the_stages_of_an_earlier_fleet(logs, tmp_path):
@@ -314,6 +352,12 @@ def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs
     listed = json.loads(said(0, "list", tmp_path, "--where", "name = 'a'", "--json").out)
     assert listed[0]["scores"]["density"] == figures["disparity"]["density"]
     assert "--truth is for one result log" in refused("score", tmp_path, "--truth", job.log)
+    assert "not merged: junk has no result (unusable)" in said(0, "export", tmp_path, tmp_path / "maps", "--merge").out
+    result = tmp_path / "a-nav.mcap"
+    with_broken(result, chunks_of(result)[0][0]).replace(result)
+    assert re.search(r"not scored: a: the chunk at byte \d+ is broken", said(3, "score", tmp_path).out)
+    result.unlink()
+    assert "not scored: a: cannot read" in said(3, "score", tmp_path).out
 
 
 def test_the_page_of_a_fleet_states_losses_and_findings_in_words(tmp_path):

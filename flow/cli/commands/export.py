@@ -104,12 +104,18 @@ def _results(options: argparse.Namespace) -> list[Path]:
         return list(options.results)
     if options.frames or options.maps or options.crs:
         raise UsageError("--merge merges regional maps in their own frame; leave out --frames, --map and --crs")
-    from flow.cli.fleet.catalogue import Catalogue
+    from flow.cli.fleet.catalogue import Catalogue, outcome
 
     results: list[Path] = []
     for result in options.results:
-        rows = Catalogue(result).rows("state = 'done' AND result IS NOT NULL") if result.is_dir() else ()
-        results += [result / row["result"] for row in rows] if result.is_dir() else [result]
+        if not result.is_dir():
+            results.append(result)
+            continue
+        for row in Catalogue(result).rows():
+            if row["state"] == "done" and row["result"] is not None:
+                results.append(result / row["result"])
+            else:
+                say(f"not merged: {row['name']} has no result ({outcome(row)})")
     if not results:
         raise UsageError(f"the fleet in {options.results[0]} has no result to merge; roverflow list says why")
     return results

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipeline, catalogue: Catalogue) -> None:
     """Say which jobs have to run, and why, and run them."""
     from flow.cli.fleet.engine import Fleet, cluster
-    from flow.cli.fleet.jobs import reason_to_run
+    from flow.cli.fleet.jobs import as_text, reason_to_run
     from flow.cli.fleet.progress import Progress
     from flow.cli.fleet.task import Task
     from flow.cli.replay import product_version
@@ -86,6 +86,8 @@ def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipelin
     size, listed = sum(job.size for job in due) / 1e9, ", ".join(f"{n} {reason}" for reason, n in reasons.items())
     more = f" ({listed}), {size:.2f} GB" if due else ""
     say(f"{counted(len(jobs), 'log')}: {len(jobs) - len(due)} done before, {len(due)} to run{more}")
+    places = {job.name: as_text(job.log) for job in jobs if job.name in rows}
+    catalogue.put_all({name: {"log": place} for name, place in places.items() if rows[name]["log"] != place})
     if not due:
         return
     tasks = {job.name: Task(job, folder, pipeline, options.rrd, options.workers_per_log) for job in due}

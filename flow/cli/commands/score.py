@@ -44,12 +44,12 @@ def _score_fleet(options: argparse.Namespace) -> int:
     if options.truth:
         raise UsageError("--truth is for one result log; the truth of a fleet is that in its logs")
     check_outputs({"scores": options.json})
-    scores, others = score_logs(options.result)
+    scores, others, damaged = score_logs(options.result)
     figures = {name: {log: json.loads(found.to_json()) for log, found in logs.items()} for name, logs in scores.items()}
     write_text(options.json, json.dumps({"fleet": str(options.result), "pipelines": figures}, indent=2))
     for pipeline, logs in scores.items():
         say(f"{pipeline}\n{as_table([dict(zip(SCORES, row, strict=True)) for row in score_rows(logs)], SCORES)}")
     for name, why in others.items():
         say(f"not scored: {name}: {why}")
-    damaged = (found for logs in scores.values() for found in logs.values() if found.lost or found.unscored)
-    return INCOMPLETE if any(damaged) else COMPLETE
+    unscored = any(found.unscored for logs in scores.values() for found in logs.values())
+    return INCOMPLETE if damaged or unscored else COMPLETE

@@ -93,16 +93,14 @@ def _run_again(result: Path, logs: list[Path], about: Mapping[str, str], out: Pa
 
 def _digests(log: Path, stated: Mapping[str, str], about: Mapping[str, str]) -> dict[str, str]:
     """The digests of the topics of a log, without those of copied inputs; raises LogError if it is damaged."""
-    from mcap.exceptions import McapError
-
-    from recordings.errors import LogError
+    from recordings.errors import LogError, sentence_of
     from recordings.mcap.digests import digests_of
 
     copies = "with_inputs" in about
     try:
         found = digests_of(log, copies)
-    except (McapError, ValueError) as error:
-        raise LogError(f"{log} is damaged: {error}; run its log again") from error
+    except Exception as error:  # mcap's reader and its decompressors fail on damage in any way
+        raise LogError(f"{log} is damaged: {sentence_of(error)}; run its log again") from error
     return {topic: digest for topic, digest in found.items() if topic in stated or not copies}
 
 

@@ -11,9 +11,11 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
+from flow.cli.checkpoint_file import remove_checkpoint
 from flow.cli.fleet.catalogue import WAITING, Catalogue
+from flow.cli.fleet.jobs import as_text
 from flow.cli.fleet.progress import Progress, frames_so_far
-from flow.cli.fleet.task import Task, about_worker, run_task, unfit
+from flow.cli.fleet.task import Task, about_worker, remove_unfinished, run_task, unfit
 from flow.errors import INCOMPLETE, RoverflowError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
 
@@ -150,14 +152,21 @@ class Fleet:
         future.cancel(force=True)
         with suppress(Exception):  # the worker may die on its own
             client.restart_workers(holders, timeout=30, raise_for_error=False)
+        self._clear(self.tasks[name])
         why = f"no frame in {self.stall_seconds:g} s, after frame {frames}"
         self._note(name, {"state": "hung", "why": why})
+
+    def _clear(self, task: Task) -> None:
+        """Remove what a log that hung has left; it is not run again."""
+        with suppress(OSError):
+            remove_checkpoint((task.result, task.result.with_suffix(".rrd")))
+        remove_unfinished(task)
 
 
 def _waiting(task: Task) -> dict[str, Any]:
     """The row of a log that waits."""
     row = WAITING | task.identity()
-    return row | {"log": str(task.job.log), "bytes": task.job.size, "pipeline": task.pipeline.label}
+    return row | {"log": as_text(task.job.log), "bytes": task.job.size, "pipeline": task.pipeline.label}
 
 
 def _ended(task: Task, row: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from glob import glob
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,11 @@ from typing import Any
 from flow.cli.fleet.catalogue import ENDED
 from flow.errors import UsageError
 from recordings.containers.digest import log_digest
-from recordings.containers.finding import RESULT_ENDING, SUFFIXES, find_files
+from recordings.containers.finding import METADATA, RESULT_ENDING, ZSTD_SUFFIXES, find_files, is_log_name
 from recordings.errors import LogError
 from recordings.scoring.result_log import about_run
 
+UNREADABLE = "unreadable"  # instead of a digest
 _COMMENT = re.compile(r"(?:^|\s)#(?:\s|$)")  # a name may contain #
 
 
@@ -33,23 +34,32 @@ class Job:
 def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, Any]] = ()) -> list[Job]:
     """The jobs of logs, folders of logs, patterns, and text files that list these; the largest first.
 
-    A folder that is one recording is one job. A log of the catalogue's rows keeps its name, whatever else is given.
-    Raises UsageError if there is no log, or if a log has the name of another one.
+    The files of one recording are one job. A log of the catalogue's rows keeps its name, whatever else is given, also
+    where it was moved. Links to another one of the logs are left out. Raises UsageError if there is no log, or if a
+    log has the name of another one.
     """
     found = (path for word in given for path in _logs(word, folder))
-    logs = list(dict.fromkeys(path.resolve() if ".." in path.parts else path.absolute() for path in found))
+    places: dict[Path, Path] = {}
+    for path in found:
+        own = path.resolve() if ".." in path.parts else path.absolute()
+        real = _real(own)
+        if real == own or real not in places:
+            places[real] = own
+    logs = list(places.values())
     if not logs:
         raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, glob patterns or a list of them")
     root = Path(os.path.commonpath([log.parent for log in logs]))
     known = {row["log"]: row["name"] for row in rows}
-    jobs = [_job(log, root, known.get(str(log))) for log in logs]
+    gone = {row["log_digest"]: row["name"] for row in rows if not Path(row["log"]).exists()}
+    jobs = [_job(log, root, known.get(as_text(log))) for log in logs]
+    jobs = [job if as_text(job.log) in known else replace(job, name=gone.get(job.digest, job.name)) for job in jobs]
     names = [job.name for job in jobs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise UsageError(f"two logs have the name {twice[0]}; give them in different folders, or rename one")
     digests = {row["name"]: row["log_digest"] for row in rows}
     for job in jobs:
-        if str(job.log) not in known and digests.get(job.name, job.digest) != job.digest:
+        if as_text(job.log) not in known and digests.get(job.name, job.digest) != job.digest:
             other = next(log for log, name in known.items() if name == job.name)
             raise UsageError(
                 f"{folder} has results of {other} under the name {job.name}; choose another --out, or rename {job.log}"
@@ -86,7 +96,7 @@ def _logs(word: str, folder: Path, lists: tuple[Path, ...] = ()) -> Iterable[Pat
     path = Path(word)
     if path.is_dir():
         yield from _in_folder(path, folder)
-    elif path.is_file() and path.suffix not in SUFFIXES:
+    elif path.is_file() and not is_log_name(path.name):
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
@@ -106,30 +116,48 @@ def _logs(word: str, folder: Path, lists: tuple[Path, ...] = ()) -> Iterable[Pat
             yield from _logs(item, folder, lists)
 
 
-def _in_folder(path: Path, folder: Path) -> Iterable[Path]:
-    """A folder that is one recording, or the logs in it and in its folders, without results and the fleet's own."""
+def _in_folder(path: Path, folder: Path, above: tuple[Path, ...] = ()) -> Iterable[Path]:
+    """The logs in a folder and in its folders, without results and the fleet's own.
+
+    The files of one recording, a split or listed one, are the log `path`. above: the folders around it.
+    """
     try:
         files = find_files(path).files
     except LogError:
         files = ()
-    if len(files) > 1 or (path / "metadata.yaml").is_file():
+    packed = any(file.name.endswith(ZSTD_SUFFIXES) for file in files)
+    if len(files) > 1 or packed or (files and (path / METADATA).is_file()):
         yield path
-        return
+    else:
+        files = ()
+    inside = (*above, _real(path))
     for item in sorted(path.iterdir()):
-        if item.resolve() == folder.resolve() or item.name.startswith("."):
+        if item in files or item.name.startswith(".") or _real(item) in (folder.resolve(), *inside):
             continue
         if item.is_dir():
-            yield from _in_folder(item, folder)
-        elif item.suffix in SUFFIXES and not (item.stem.endswith(RESULT_ENDING) and about_run(item)):
+            yield from _in_folder(item, folder, inside)
+        elif is_log_name(item.name) and not (item.stem.endswith(RESULT_ENDING) and about_run(item)):
             yield item
 
 
+def _real(path: Path) -> Path:
+    """Where links lead to, also if it is not there; a link that leads nowhere but to itself is its own place."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):  # a loop
+        return path
+
+
+def as_text(path: Path) -> str:
+    """A path as the catalogue has it: names that are not Unicode have escapes."""
+    return str(path).encode("utf-8", "backslashreplace").decode()
+
+
 def _job(log: Path, root: Path, name: str | None) -> Job:
-    files = find_files(log).files
     beside = log.relative_to(root)
     try:
-        digest = log_digest(files)
-        size = sum(file.stat().st_size for file in files)
-    except OSError as error:
-        raise UsageError(f"cannot read {error.filename}: {error.strerror or error}") from error
-    return Job(name or (beside if log.is_dir() else beside.with_suffix("")).as_posix(), log, size, digest)
+        files = find_files(log).files
+        digest, size = log_digest(files), sum(file.stat().st_size for file in files)
+    except (OSError, LogError):  # its run says why
+        digest, size = UNREADABLE, 0
+    return Job(name or as_text(beside if log.is_dir() else beside.with_suffix("")), log, size, digest)

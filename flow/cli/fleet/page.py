@@ -32,22 +32,30 @@ def write_fleet_page(path: Path, folder: Path) -> None:
     write_page(path, folder.resolve().name, [about, f"<h2>Logs</h2>{html_table(cells, _COLUMNS)}"])
 
 
-def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], dict[str, str]]:
-    """Pipeline -> log -> score, and log -> why it has no score; the catalogue keeps the scores."""
-    scores, others = dict[str, dict[str, Score]](), dict[str, str]()
+def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], dict[str, str], set[str]]:
+    """Pipeline -> log -> score; log -> why it has no score; and those of them whose result is gone or damaged.
+
+    The catalogue keeps the scores.
+    """
+    scores, others, damaged = dict[str, dict[str, Score]](), dict[str, str](), set[str]()
     catalogue = Catalogue(folder, create=(folder / NAME).is_file())
     for row in catalogue.rows():
         try:
             if row["state"] != "done" or row["result"] is None:
                 raise LogError("no result")
+            if not (folder / row["result"]).is_file():
+                damaged.add(row["name"])
             found = score(folder / row["result"], Path(row["log"]))
+            if found.lost:
+                damaged.add(row["name"])
+                raise LogError("; ".join(why for reasons in found.lost.values() for why in reasons))
         except LogError as error:  # the log has no truth, is gone or damaged
             others[row["name"]] = str(error)
             continue
         known = {name: value for name, value in zip(SCORES[1:], brief_figures(found), strict=True) if value == value}
         catalogue.put(row["name"], {"scores": known})
         scores.setdefault(row["pipeline"], {})[row["name"]] = found
-    return scores, others
+    return scores, others, damaged
 
 
 def score_rows(scores: Mapping[str, Score]) -> list[tuple[str, ...]]:

@@ -10,7 +10,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
-from flow.cli.fleet.catalogue import Catalogue
+from flow.cli.fleet.catalogue import Catalogue, outcome
 from flow.cli.report import duration, say
 from flow.contracts import counted
 from flow.errors import COMPLETE, INCOMPLETE
@@ -71,14 +71,14 @@ class Progress(AbstractContextManager["Progress"]):
 
 
 def watch(catalogue: Catalogue) -> int:
-    """Show a fleet of another process until its logs have ended; the exit code is 3 if the process ends before."""
+    """Show a fleet of another process until its logs have ended; the exit code is 3 unless all are COMPLETE."""
     rows = _rows(catalogue)
     while not _active(rows) and catalogue.is_held():  # it starts
         time.sleep(WATCH_SECONDS / 10)
         rows = _rows(catalogue)
     say(_states(rows))
     left = {name: row["bytes"] for name, row in _active(rows).items()}
-    frames = sum(row["frames"] or 0 for row in rows.values())
+    frames, any_left = sum(row["frames"] or 0 for row in rows.values()), bool(left)
     with Progress(left, len(rows) - len(left), frames) as progress:
         while left:
             held = catalogue.is_held()  # before the rows, so that these are the last ones of a process that ended
@@ -94,8 +94,9 @@ def watch(catalogue: Catalogue) -> int:
                 )
                 return INCOMPLETE
             time.sleep(WATCH_SECONDS if left else 0.0)
-    say(_states(rows))
-    return COMPLETE
+    if any_left:
+        say(_states(rows))
+    return COMPLETE if {outcome(row) for row in rows.values()} <= {"COMPLETE"} else INCOMPLETE
 
 
 def frames_so_far(file: Path) -> int | None:

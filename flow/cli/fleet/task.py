@@ -15,8 +15,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from flow.cli.checkpoint_file import checkpoint_of
+from flow.cli.checkpoint_file import checkpoint_of, is_being_written
 from flow.cli.fleet.jobs import Job
+from flow.cli.fleet.progress import frames_so_far
 from flow.cli.replay import LIBRARIES, product_version, replay
 from flow.cli.report import by_cause
 from flow.config.loader import load, shipped
@@ -24,6 +25,7 @@ from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.runtime.findings import lines
+from recordings.atomic_write import writing
 from recordings.containers.digest import digest_lines
 from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
@@ -131,10 +133,8 @@ def run_task(task: Task) -> dict[str, Any]:
     node = {"node": f"{platform.node()}:{os.getpid()}"}
     if why := _absent(task):  # no fault of the log
         return task.identity() | node | {"state": "failed", "why": f"{platform.node()} {why}"}
-    task.result.parent.mkdir(parents=True, exist_ok=True)
-    if not checkpoint_of(task.result).exists():
-        _remove_unfinished(task)
     try:
+        _prepare(task)
         summary = _run(task)
     except Exception as error:  # the log, a stage of the user's own, or the disk
         usable = isinstance(error, UnwritableError) or not isinstance(error, UsageError | LogError)
@@ -143,14 +143,31 @@ def run_task(task: Task) -> dict[str, Any]:
         return task.identity() | node | {"state": "failed" if usable else "unusable", "why": why}
     finally:
         with suppress(OSError):
-            task.progress.unlink()
+            if frames_so_far(task.progress) is not None:
+                task.progress.unlink()
     if not checkpoint_of(task.result).exists():
-        _remove_unfinished(task)
+        remove_unfinished(task)
     row = task.identity() | node | _columns(summary)
     partial = task.result.with_name(f"{task.result.name}.{os.getpid()}-note.partial")
     partial.write_text(json.dumps({"row": row, "summary": summary}, indent=2))
     partial.replace(task.note)
     return row
+
+
+def _prepare(task: Task) -> None:
+    """Make the folder of the result, and remove what a worker that died has left.
+
+    Raises UnwritableError where files of others are, or if the names are too long.
+    """
+    with writing(task.result):
+        task.result.parent.mkdir(parents=True, exist_ok=True)
+        dead = not checkpoint_of(task.result).exists() and not is_being_written(task.result)
+    own = {task.note: _note(task) is not None, task.progress: frames_so_far(task.progress) is not None}
+    for file, ours in own.items():
+        if file.exists() and not ours:
+            raise UnwritableError(f"{file} is not a file of a fleet; rename it, or choose another --out")
+    if dead:
+        remove_unfinished(task)
 
 
 def _run(task: Task) -> dict[str, Any]:
@@ -177,7 +194,7 @@ def _run(task: Task) -> dict[str, Any]:
     return replay(log, pipeline, task.result, recording, **options)
 
 
-def _remove_unfinished(task: Task) -> None:
+def remove_unfinished(task: Task) -> None:
     """Remove what workers that died have left of the task's outputs."""
     for suffix in (".mcap", ".rrd"):
         for unfinished in task.result.parent.glob(f"{task.result.stem}{suffix}.*.partial"):
@@ -210,14 +227,22 @@ def _why(summary: Mapping[str, Any], found: Mapping[str, Mapping[str, str]]) -> 
 
 def _finished(task: Task) -> dict[str, Any] | None:
     """The row of an earlier run of the same, if its files are there."""
-    try:
-        row: dict[str, Any] = json.loads(task.note.read_text())["row"]
-    except (OSError, ValueError, KeyError, TypeError):
+    row = _note(task)
+    if row is None:
         return None
     same = all(row.get(name) == value for name, value in task.identity().items())
     files = [task.result, *([task.result.with_suffix(".rrd")] if task.recording else [])]
     there = row["result"] is None or all(file.is_file() for file in files)
     return row if same and row["state"] == "done" and there else None
+
+
+def _note(task: Task) -> dict[str, Any] | None:
+    """The row in the summary beside the result; None if there is none, or a file of another kind."""
+    try:
+        row = json.loads(task.note.read_text())["row"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return row if isinstance(row, dict) else None
 
 
 def about_worker(task: Task) -> dict[str, str]:
