@@ -148,14 +148,20 @@ def test_a_task_goes_on_where_a_worker_died_if_the_pipeline_can(tmp_path, monkey
     (tmp_path / "own.yaml").write_text(TRAPPED.replace("trap.Trap", f"{module}.Locked"))
     (job,) = jobs_of([str(tmp_path / "log.mcap")], tmp_path / "out")
     task = Task(job, tmp_path / "out", Pipeline.of(str(tmp_path / "own.yaml"), ()), recording=False, workers=1)
-    died, write_text = tmp_path / "died", Path.write_text
+    died, write_text, keep = tmp_path / "died", Path.write_text, checkpoint_file.CheckpointFile.keep
 
-    def die(file, text):
-        if file == task.progress and text == "6" and not died.exists():  # five frames are through
+    def write(file, text):
+        if locked and file == task.progress and text == "6":  # five frames are through
             shutil.copytree(tmp_path / "out", died)
         return write_text(file, text)
 
-    monkeypatch.setattr(Path, "write_text", die)
+    def kept(file, checkpoint):
+        keep(file, checkpoint)
+        if not died.exists():
+            shutil.copytree(tmp_path / "out", died)
+
+    monkeypatch.setattr(Path, "write_text", write)
+    monkeypatch.setattr(checkpoint_file.CheckpointFile, "keep", kept)
     wanted = run_task(task)
     assert (died / "log-nav.mcap.checkpoint").exists() != locked
     (died / "log-nav.mcap.1-0.partial").touch()
