@@ -186,6 +186,8 @@ def regions_of(result: Path, lost: Counter[str] | None, topics: MapTopics, color
         if part := part_with(regions, topics, frame):
             part.add(result, topics, stamp, frame)
             newest[part.frame_id] = part
+            if part.map_stamp < stamp:  # its last map came with the first frame of the next part
+                del newest[part.frame_id]
         if "level" in frame and frame["level"].parent in newest:
             newest[frame["level"].parent].color(result, frame)
     if not regions:

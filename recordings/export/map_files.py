@@ -45,7 +45,8 @@ FRAME = MapTopics("/nav/elevation_map", "/nav/navigation_map")
 class MapFiles:
     """Maps on one grid, as far as they have been read.
 
-    wanted: layers of the elevation map; none: all; epoch: ns, from which the layers "first" and "last" count.
+    wanted: layers of the elevation map; none: all; epoch: ns, from which the layers "first" and "last" count; stamp:
+    of the last frame with a map, ns; map_stamp: of that map, which may be that of an earlier frame.
     """
 
     rim: float
@@ -55,6 +56,7 @@ class MapFiles:
     navigation: Mosaic | None = None
     colors: Tiles = field(default_factory=lambda: Tiles(CELL_COLOR))
     stamp: int = 0
+    map_stamp: int = 0
     place: Georeference | None = None
     wanted: Collection[str] = ()
 
@@ -63,12 +65,14 @@ class MapFiles:
         self.stamp = stamp
         if topics.elevation in frame:
             terrain: ElevationMap = read(ros2.read_grid_map, frame[topics.elevation], result)
+            self.map_stamp = terrain.stamp
             layers = {name: terrain.layers[name] for name in self.wanted or terrain.layers}
             fills = dict.fromkeys(layers, np.float32(np.nan))
             self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
             self.elevation.add(layers, np.isfinite(terrain.layers["elevation"]), terrain)
         if topics.navigation in frame:
             cells: NavigationMap = read(ros2.read_occupancy_grid, frame[topics.navigation], result)
+            self.map_stamp = cells.stamp
             fill = {"cells": np.int8(Cell.UNKNOWN)}
             self.navigation = self.navigation or Mosaic(cells.resolution, cells.frame_id, fill, self.rim)
             self.navigation.add({"cells": cells.cells}, cells.cells != Cell.UNKNOWN, cells)
@@ -121,15 +125,18 @@ def part_with(
 ) -> MapFiles | None:
     """The part of a regional map that the maps of a frame belong to, new in `regions` where it begins; None without.
 
-    A part begins where the map was reset: it has a frame of reference or an epoch of its own.
+    A part begins where the map was reset: it has a frame of reference or an epoch of its own. A map whose epoch is lost
+    belongs to the newest part.
     """
     topic = next((topic for topic in topics if topic in frame), None)
     if topic is None:
         return None
-    frame_id, epoch = frame[topic].header.frame_id, ros2.epoch_of(frame[DIAGNOSTICS], topics.elevation)
+    frame_id = frame[topic].header.frame_id
+    epoch = ros2.epoch_of(frame[DIAGNOSTICS], topics.elevation or REGIONAL.elevation)
     parts = [part for part in regions.values() if part.frame_id == frame_id]
-    for part in parts:
-        if part.epoch == epoch:
+    for part in reversed(parts):
+        if epoch is None or part.epoch in (None, epoch):
+            part.epoch = epoch if part.epoch is None else part.epoch
             return part
     name = f"{frame_id}/part-{len(parts) + 1}" if parts else frame_id
     regions[name] = MapFiles(RIM_WIDTH, frame_id, epoch, wanted=wanted)

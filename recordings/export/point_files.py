@@ -77,8 +77,8 @@ def write_cells(path: Path, terrain: Mosaic, colors: Tiles, about: str) -> None:
             if has_sigma:
                 vertices["sigma"] = np.sqrt(terrain.block("variance", low, 0, count, cols)[known])
             if colored:
-                cells = colors.read(first_row + low, first_col, count, cols)
-                rgb = _nearest_colors(cells["rgb"], cells["seen"] > 0)[known]
+                cells = colors.read(first_row + low - STRIP_ROWS, first_col, count + 2 * STRIP_ROWS, cols)
+                rgb = _nearest_colors(cells["rgb"], cells["seen"] > 0)[STRIP_ROWS : STRIP_ROWS + count][known]
                 for place, (name, _) in enumerate(COLORS):
                     vertices[name] = rgb[:, place]
             yield vertices

@@ -113,7 +113,7 @@ def _regional(facts: RunFacts) -> str:
             notes.append(f"<p>{escape(str(error))}</p>")
     drawn.sort(key=lambda found: -found[0])
     if (more := len(drawn) - MAX_REGIONS) > 0:
-        notes.append(f"<p>{counted(more, 'smaller map')} in other frames of reference.</p>")
+        notes.append(f"<p>{counted(more, 'smaller map')} in other frames of reference or parts.</p>")
     pages = [page for _, maps in drawn[:MAX_REGIONS] for page in _region_pages(maps)]
     pictures = [picture(page, f"regional {name} map") for name, page in pages]
     return "".join([f"<div class=pictures>{''.join(pictures)}</div>" if pictures else "", *notes])

@@ -174,7 +174,7 @@ def epoch_of(statuses: Iterable[Any], topic: str | None) -> int | None:
     """The epoch, ns, of the map of a topic, by the diagnostics of its stamp; None if they do not contain it."""
     for status in statuses:
         for pair in status.values if f"/nav/{status.name}" == topic else ():
-            if pair.key == "epoch":
+            if pair.key == "epoch" and pair.value.removeprefix("-").isdecimal():
                 return int(pair.value)
     return None
 

@@ -118,7 +118,7 @@ class Tilt:
             for sample, later in pairwise(samples):
                 if later.stamp >= stamp:
                     return sample.interpolated(later, stamp)
-            raise StageError(f"Tilt.smoothed: {stamp} ns is after the last sample")
+            raise StageError(f"Tilt.smoothed: no two samples lie around {stamp} ns")
         seconds = (np.array([sample.stamp for sample in samples]) - stamp) / 1e9
         line = np.column_stack([np.ones_like(seconds), seconds])
         weights = np.linalg.pinv(line)[0]

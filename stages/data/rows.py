@@ -26,11 +26,14 @@ def disparity_rows(disparity: Disparity, first: int, end: int) -> Disparity:
 def rows_without_sigma(disparity: Disparity) -> range:
     """The rows of a partly refined disparity image that have no sigma: they are to be refined. Else no row.
 
-    An image is partly refined if it has known pixels with a sigma and others without.
+    An image is partly refined if it has a row of known pixels of which none has a sigma.
     """
-    if disparity.sigma is None or not (np.isnan(disparity.sigma) & ~np.isnan(disparity.pixels)).any():
+    if disparity.sigma is None:
         return range(0)
-    rows = np.flatnonzero(np.isnan(disparity.sigma).all(axis=1))
+    without = np.isnan(disparity.sigma).all(axis=1)
+    if not np.isfinite(disparity.pixels[without]).any():
+        return range(0)
+    rows = np.flatnonzero(without)
     return range(rows[0], rows[-1] + 1) if 0 < len(rows) < len(disparity.pixels) else range(0)
 
 

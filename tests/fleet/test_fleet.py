@@ -105,6 +105,17 @@ class Locked:
 """
 
 
+def test_a_link_that_leads_nowhere_is_unusable_and_not_tried_again(tmp_path, said):
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs/gone.mcap").symlink_to("nowhere")
+    (job,) = jobs_of([str(tmp_path / "logs")], tmp_path / "out")
+    task = Task(job, tmp_path / "out", Pipeline.of("fast", ()), recording=False, workers=1)
+    row = run_task(task)
+    assert (row["state"], unfit(task)) == ("unusable", "")
+    assert "gone.mcap: No such file or directory" in row["why"]
+    assert reason_to_run(job, row, task.pipeline.digest, row["version"], task.folder) == ""
+
+
 @pytest.mark.parametrize("ending", ["json", "progress"])
 def test_a_task_replaces_no_file_of_others(logs, tmp_path, ending):
     (job,) = (job for job in jobs_of([str(logs)], tmp_path) if job.name == "a")
@@ -362,6 +373,8 @@ def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs
     result = tmp_path / "a-nav.mcap"
     with_broken(result, chunks_of(result)[0][0]).replace(result)
     assert re.search(r"not scored: a: the chunk at byte \d+ is broken", said(3, "score", tmp_path).out)
+    result.write_bytes(b"")
+    assert "not scored: a:" in said(3, "score", tmp_path).out
     result.unlink()
     assert "not scored: a: cannot read" in said(3, "score", tmp_path).out
 

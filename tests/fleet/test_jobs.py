@@ -76,4 +76,31 @@ def test_a_log_that_was_moved_keeps_its_name_and_is_not_run_again(tmp_path):
         (row for row in rows if row["name"] == "a"),
     ))  # fmt: skip
     assert moved.log == logs / "renamed.mcap"
+    make(logs, "a.mcap")  # another log under the old name
+    rows = [{**row, "log": str(moved.log)} if row["name"] == "a" else row for row in rows]
+    assert names(logs, rows=rows) == ["a", "a-2", "b"]
     assert reason_to_run(moved, row, "p", "v", tmp_path) == ""
+
+
+def test_a_log_that_cannot_be_read_takes_the_name_of_no_other_one(tmp_path):
+    logs = make(tmp_path / "logs", "a.mcap")
+    row = {"name": "z", "log": str(logs / "z.mcap"), "log_digest": UNREADABLE}
+    for name in ("x.mcap", "y.mcap"):
+        (logs / name).symlink_to("nowhere")
+    assert names(logs, rows=[row]) == ["a", "x", "y"]
+
+
+def test_copies_of_a_log_that_was_moved_have_names_of_their_own(tmp_path):
+    logs = make(tmp_path / "logs", "new/a.mcap")
+    (logs / "new/b.mcap").write_bytes((logs / "new/a.mcap").read_bytes())
+    (job, _) = jobs_of([str(logs)], tmp_path / "out")
+    rows = [{"name": name, "log": str(logs / f"old/{name}.mcap"), "log_digest": job.digest} for name in ("a", "b")]
+    assert len(set(names(logs, rows=rows))) == 2
+
+
+def test_a_log_that_a_link_named_first_keeps_its_name(tmp_path):
+    logs, elsewhere = make(tmp_path / "logs", "a.mcap"), make(tmp_path / "elsewhere", "c.mcap")
+    (logs / "c.mcap").symlink_to(elsewhere / "c.mcap")
+    rows = [{"name": job.name, "log": str(job.log), "log_digest": job.digest} for job in jobs_of([str(logs)], tmp_path)]
+    again = jobs_of([str(logs), str(elsewhere)], tmp_path, rows)
+    assert sorted(job.name for job in again) == ["a", "c"]

@@ -14,7 +14,7 @@ from typing import Any
 from flow.cli.checkpoint_file import remove_checkpoint
 from flow.cli.fleet.catalogue import WAITING, Catalogue
 from flow.cli.fleet.jobs import as_text
-from flow.cli.fleet.progress import Progress, frames_so_far
+from flow.cli.fleet.progress import Progress, frames_so_far, is_progress
 from flow.cli.fleet.task import Task, about_worker, remove_unfinished, run_task, unfit
 from flow.errors import INCOMPLETE, RoverflowError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
@@ -76,7 +76,8 @@ class Fleet:
         """The future of a task; the smallest place runs first."""
         task = self.tasks[name]
         with suppress(OSError):  # of a worker that died
-            task.progress.unlink()
+            if is_progress(task.progress):
+                task.progress.unlink()
         self._seen.pop(name, None)
         key = f"roverflow-{task.job.digest}-{time.time_ns()}"
         return client.submit(run_task, task, key=key, priority=-place, pure=False)

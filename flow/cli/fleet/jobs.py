@@ -7,6 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from glob import glob
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -39,20 +40,18 @@ def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, An
     log has the name of another one.
     """
     found = (path for word in given for path in _logs(word, folder))
+    known = {row["log"]: row["name"] for row in rows}
     places: dict[Path, Path] = {}
     for path in found:
         own = path.resolve() if ".." in path.parts else path.absolute()
         real = _real(own)
-        if real == own or real not in places:
+        if real not in places or as_text(own) in known or (real == own and as_text(places[real]) not in known):
             places[real] = own
     logs = list(places.values())
     if not logs:
         raise UsageError(f"there is no log in {', '.join(given)}; give files, folders, glob patterns or a list of them")
     root = Path(os.path.commonpath([log.parent for log in logs]))
-    known = {row["log"]: row["name"] for row in rows}
-    gone = {row["log_digest"]: row["name"] for row in rows if not Path(row["log"]).exists()}
-    jobs = [_job(log, root, known.get(as_text(log))) for log in logs]
-    jobs = [job if as_text(job.log) in known else replace(job, name=gone.get(job.digest, job.name)) for job in jobs]
+    jobs = _renamed([_job(log, root, known.get(as_text(log))) for log in logs], rows)
     names = [job.name for job in jobs]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
@@ -65,6 +64,29 @@ def jobs_of(given: Sequence[str], folder: Path, rows: Collection[Mapping[str, An
                 f"{folder} has results of {other} under the name {job.name}; choose another --out, or rename {job.log}"
             )
     return sorted(jobs, key=lambda job: (-job.size, job.name))
+
+
+def _renamed(jobs: Sequence[Job], rows: Collection[Mapping[str, Any]]) -> list[Job]:
+    """The jobs with the names of the catalogue, also of moved logs; a new log of such a name gets a number."""
+    known = {row["log"]: row["name"] for row in rows}
+    names = {job.log: known[as_text(job.log)] for job in jobs if as_text(job.log) in known}
+    gone = {
+        row["log_digest"]: row["name"]
+        for row in rows
+        if row["log_digest"] != UNREADABLE
+        and row["name"] not in names.values()
+        and not os.path.lexists(row["log"])
+        and "\\udc" not in row["log"]  # the escape of a name that is not Unicode
+    }
+    for job in jobs:
+        if job.log not in names and job.digest in gone:
+            names[job.log] = gone.pop(job.digest)
+    held = set(names.values())
+    for job in jobs:
+        if job.log not in names:
+            numbered = (f"{job.name}-{number}" for number in count(2))
+            names[job.log] = next(name for name in chain([job.name], numbered) if name not in held)
+    return [replace(job, name=names[job.log]) for job in jobs]
 
 
 def reason_to_run(
@@ -141,9 +163,9 @@ def _in_folder(path: Path, folder: Path, above: tuple[Path, ...] = ()) -> Iterab
 
 
 def _real(path: Path) -> Path:
-    """Where links lead to, also if it is not there; a link that leads nowhere but to itself is its own place."""
+    """Where links lead to; a link that leads nowhere is its own place."""
     try:
-        return path.resolve()
+        return path.resolve(strict=True)
     except (OSError, RuntimeError):  # a loop
         return path
 

@@ -13,6 +13,7 @@ from flow.cli.fleet.catalogue import NAME, Catalogue, outcome, shown
 from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.reporting.page import html_table, write_page
+from recordings.scoring.result_log import about_run
 from recordings.scoring.score import Score, score
 from recordings.scoring.table import SCORES, brief_figures, brief_row
 
@@ -43,7 +44,7 @@ def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], dict[str, str
         try:
             if row["state"] != "done" or row["result"] is None:
                 raise LogError("no result")
-            if not (folder / row["result"]).is_file():
+            if not about_run(folder / row["result"]):
                 damaged.add(row["name"])
             found = score(folder / row["result"], Path(row["log"]))
             if found.lost:

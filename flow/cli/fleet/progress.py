@@ -107,6 +107,14 @@ def frames_so_far(file: Path) -> int | None:
         return None
 
 
+def is_progress(file: Path) -> bool:
+    """Whether a file contains the frames of a log that runs, or nothing, as one that is being written."""
+    try:
+        return (file.read_text() or "0").isdecimal()
+    except (OSError, ValueError):
+        return False
+
+
 def line_of(row: Mapping[str, Any]) -> str:
     """One line about a log that has ended."""
     if row["state"] != "done":

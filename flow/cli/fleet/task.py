@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.checkpoint_file import checkpoint_of, is_being_written
-from flow.cli.fleet.jobs import Job
-from flow.cli.fleet.progress import frames_so_far
+from flow.cli.fleet.jobs import UNREADABLE, Job
+from flow.cli.fleet.progress import is_progress
 from flow.cli.replay import LIBRARIES, product_version, replay
 from flow.cli.report import by_cause
 from flow.config.loader import load, shipped
@@ -143,7 +143,7 @@ def run_task(task: Task) -> dict[str, Any]:
         return task.identity() | node | {"state": "failed" if usable else "unusable", "why": why}
     finally:
         with suppress(OSError):
-            if frames_so_far(task.progress) is not None:
+            if is_progress(task.progress):
                 task.progress.unlink()
     if not checkpoint_of(task.result).exists():
         remove_unfinished(task)
@@ -162,7 +162,7 @@ def _prepare(task: Task) -> None:
     with writing(task.result):
         task.result.parent.mkdir(parents=True, exist_ok=True)
         dead = not checkpoint_of(task.result).exists() and not is_being_written(task.result)
-    own = {task.note: _note(task) is not None, task.progress: frames_so_far(task.progress) is not None}
+    own = {task.note: _note(task) is not None, task.progress: is_progress(task.progress)}
     for file, ours in own.items():
         if file.exists() and not ours:
             raise UnwritableError(f"{file} is not a file of a fleet; rename it, or choose another --out")
@@ -255,7 +255,9 @@ def about_worker(task: Task) -> dict[str, str]:
 
 
 def _absent(task: Task) -> str:
-    return "" if task.job.log.exists() else f"has no {task.job.log}; paths must mean the same on all machines"
+    if task.job.log.exists() or task.job.digest == UNREADABLE:  # which the run reports
+        return ""
+    return f"has no {task.job.log}; paths must mean the same on all machines"
 
 
 def unfit(task: Task) -> str:

@@ -193,6 +193,34 @@ def test_the_parts_of_a_map_that_was_reset_have_a_folder_and_an_epoch_each(tmp_p
             row, col = file.index(1.35, 2.85)
             assert file.read(1)[row, col] == pytest.approx(float(ground(1.35, 2.85)) + raised, abs=1e-6)
             assert f"first and last count from {epoch} ns" in file.crs.to_wkt()
+    export(path, tmp_path / "navigation", maps=["regional_navigation_map"])
+    assert {folder.name for folder in (tmp_path / "navigation").iterdir()} == {"odom", "odom-part-2"}
+
+
+def test_a_map_without_its_epoch_belongs_to_the_part_before_it(tmp_path):
+    """Its diagnostics are in a damaged chunk."""
+    messages = list[tuple[int, str, Any]]()
+    for frame in range(3):
+        terrain, _ = window(frame, CORNERS[frame % 2], (30, 40))
+        messages.append((terrain.stamp, "/nav/regional_map", ros2.grid_map(terrain)))
+        about = [(0, "regional_map", "", {"epoch": str(START)})] if frame == 1 else []
+        messages.append((terrain.stamp, "/nav/diagnostics", ros2.diagnostics(terrain.stamp, about)))
+    files = export(write_messages(tmp_path / "out.mcap", messages), tmp_path / "out")
+    assert {file.parent for file in files} == {tmp_path / "out"}
+
+
+def test_points_of_the_frame_that_resets_a_map_colour_no_part_of_it(tmp_path):
+    """The last map of a part comes with that frame, and `level` is that of the next part."""
+    terrain, _ = window(0, CORNERS[0], (30, 40))
+    messages = [(START, "/nav/regional_map", ros2.grid_map(terrain))]
+    messages.append((START + 1, "/nav/regional_map", ros2.grid_map(terrain)))
+    for frame in range(2):
+        sent = replace(cloud(frame), colors=np.full((3, 3), 200 - 100 * frame, np.uint8))
+        sent = replace(sent, sigma=sent.sigma / (1 + frame))
+        messages.append((sent.stamp, "/nav/points", ros2.point_cloud(sent)))
+        messages.append((sent.stamp, "/tf", ros2.transform_message([(LEVEL, sent.stamp)])))
+    export(write_messages(tmp_path / "out.mcap", messages), tmp_path / "out")
+    assert set(points_in(tmp_path / "out")["red"].tolist()) == {200}
 
 
 def test_maps_of_two_frames_of_reference_are_not_laid_over_each_other(result, tmp_path):

@@ -178,7 +178,7 @@ def test_poses_of_different_frames_are_not_interpolated(frames):
 
 def test_tilts_are_not_smoothed_beyond_the_samples_of_a_filter():
     samples = [Tilt(stamp, [0, 0, 1.0], filtered=True) for stamp in range(3)]
-    for given, message in ((samples, "10 ns is after the last sample"), ([], "there are no samples")):
+    for given, message in ((samples, "no two samples lie around 10 ns"), ([], "there are no samples")):
         with pytest.raises(ValueError, match=message):
             Tilt.smoothed(given, 10)
 

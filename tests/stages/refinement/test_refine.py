@@ -120,6 +120,7 @@ def test_matches_with_their_own_sigma_are_refined_as_others_are():
     empty = np.where(np.arange(HEIGHT)[:, None] < 20, np.float32(np.nan), MATCHES.pixels)  # rows of sky
     matches = disparity_of(empty, confidence=MATCHES.confidence, stamp=5, camera=CAMERA)
     sigma = np.where(np.isfinite(empty), np.float32(0.25), np.float32(np.nan))
+    sigma[np.unravel_index(np.argmax(np.isfinite(empty)), empty.shape)] = np.nan  # one match without
     one, other = (Refine()(FRAME, each) for each in (matches, replace(matches, sigma=sigma)))
     assert one.pixels.tobytes() == other.pixels.tobytes()
     assert one.segments.tobytes() == other.segments.tobytes()
