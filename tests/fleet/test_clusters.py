@@ -85,6 +85,14 @@ def ended(home: Path, out: Path, *more: object) -> str:
     return done.stdout
 
 
+def command_of(process: psutil.Process) -> str:
+    """The command line of a process; empty if it has ended."""
+    try:
+        return " ".join(process.cmdline())
+    except psutil.Error:
+        return ""
+
+
 def times(out: Path) -> dict[str, int]:
     done = [name for name, row in rows_of(out).items() if row["state"] == "done"]
     return {name: (out / f"{name}-nav.mcap").stat().st_mtime_ns for name in done}
@@ -115,7 +123,7 @@ def test_a_worker_that_is_killed_again_and_again_loses_no_log(home, tmp_path):
     assert fleet.stdout is not None
     for line in fleet.stdout:  # one more log has ended
         children = psutil.Process(fleet.pid).children(recursive=True)
-        workers = [child for child in children if "spawn_main" in " ".join(child.cmdline())]
+        workers = [child for child in children if "spawn_main" in command_of(child)]
         # A log is set aside when its worker has died four times.
         if workers and killed < 3 and " of 12: " in line:
             workers[killed % len(workers)].kill()

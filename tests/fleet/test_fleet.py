@@ -203,7 +203,7 @@ def test_a_fleet_runs_nothing_twice_and_lists_what_became_of_each_log(logs, tmp_
     table = said(0, "score", out).out.splitlines()
     assert [line.split()[0] for line in table] == ["fast", "log", "a", "b", "site/c", "mean", "not"]
     assert json.loads(rows_of(out)["a"]["scores"])["density"] > 0
-    assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in said(0, "fleet", "--out", out, "--watch").out
+    assert "3 done, 1 unusable; 4 frames so far, 0.00 GB left" in said(3, "fleet", "--out", out, "--watch").out
     listed = said(0, "list", out, "--where", "verdict != 'COMPLETE'", "--csv").out
     assert [line.split(",")[0] for line in listed.splitlines()] == ["name", "junk"]
     assert roverflow("report", out) == 0
