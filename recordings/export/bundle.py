@@ -29,7 +29,7 @@ from recordings.export.map_files import (
     part_with,
     read,
     write_whole,
-)  # fmt: skip
+)
 from recordings.export.point_files import write_cells, write_points
 from recordings.mcap.file import McapFile, iter_decoded
 from recordings.ros2 import from_msg as ros2

@@ -144,6 +144,7 @@ def part_with(
 
 
 def about_of(frame_id: str, time: str, stamp: int) -> str:
+    """The comment of a file: its frame of reference, units and time."""
     return f"roverflow: local frame '{frame_id}', metres, z up; {time} {stamp} ns"
 
 
@@ -168,6 +169,7 @@ def fields_of(cloud: Any) -> dict[str, Array]:
 
 
 def read(reader: Callable[[Any], Any], message: Any, result: Path) -> Any:
+    """What a reader makes of a message of a result log. Raises LogError for an invalid one."""
     try:
         return reader(message)
     except (ArithmeticError, LookupError, TypeError, ValueError) as error:

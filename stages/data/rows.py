@@ -24,9 +24,9 @@ def disparity_rows(disparity: Disparity, first: int, end: int) -> Disparity:
 
 
 def rows_without_sigma(disparity: Disparity) -> range:
-    """The rows of a partly refined disparity image that have no sigma: they are to be refined. Else no row.
+    """The rows of a partly refined disparity image that are to be refined; no row of any other image.
 
-    An image is partly refined if it has a row of known pixels of which none has a sigma.
+    A row with known pixels but no sigma marks such an image. The range contains all rows without sigma.
     """
     if disparity.sigma is None:
         return range(0)
