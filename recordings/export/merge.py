@@ -163,16 +163,21 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
 
 
 def _check_inputs(results: Sequence[Path]) -> None:
-    """Raise LogError for two results of the same part of the same input, which would count as independent."""
-    known: dict[Any, Path] = {}
-    for result in results:
-        about = about_run(result)
-        part = about.get("log_digest") or result.resolve(), about.get("start"), about.get("end")
-        if part in known:
+    """Raise LogError for two results with a common part of the same input, which would count as independent."""
+    abouts = [about_run(result) for result in results]
+    for first, second in combinations(range(len(results)), 2):
+        inputs = [abouts[number].get("log_digest") or results[number].resolve() for number in (first, second)]
+        (begin, end), (other_begin, other_end) = _seconds(abouts[first]), _seconds(abouts[second])
+        if inputs[0] == inputs[1] and begin < other_end and other_begin < end:
             raise LogError(
-                f"{known[part]} and {result} are results of the same input, which would count twice; give one of them"
+                f"{results[first]} and {results[second]} are results of the same input, which would count twice; "
+                "give one of them"
             )
-        known[part] = result
+
+
+def _seconds(about: Mapping[str, str]) -> tuple[float, float]:
+    """The part of its input that a run read."""
+    return float(about.get("start") or "-inf"), float(about.get("end") or "inf")
 
 
 def merged_cells(elevation: Array, variance: Array) -> tuple[Array, Array]:

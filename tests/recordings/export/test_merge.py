@@ -1,6 +1,7 @@
 """Regional maps of several logs as one: the mean, its logs, and logs that do not fit."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ from tests.conftest import chunks_of, edit_of, rewrite, roverflow, with_broken
 STEP, SHAPE = 0.1, (50, 60)
 
 
-def traverse(path: Path, first_col: int, height: float, variance: float, hazard_col: int, frame: str = "map") -> Path:
+def traverse(
+    path: Path, first_col: int, height: float, variance: float, hazard_col: int, frame: str = "map", **about: str
+) -> Path:
     """A result log with a sloping map of SHAPE that begins at a column; one column of it is hazardous."""
     cols = first_col + np.arange(SHAPE[1])
     elevation = np.tile(np.float32(height + 0.01 * cols), (SHAPE[0], 1))
@@ -29,6 +32,7 @@ def traverse(path: Path, first_col: int, height: float, variance: float, hazard_
     cells = np.where(np.tile(cols, (SHAPE[0], 1)) == hazard_col, Cell.HAZARD, Cell.FREE).astype(np.int8)
     origin = (first_col * STEP, -2.0)
     with Ros2Writer(path) as writer:
+        writer.metadata("roverflow", about)
         writer.write("/nav/regional_map", ros2.grid_map(ElevationMap(5, layers, STEP, origin, frame)), 5)
         writer.flush()  # a broken second chunk leaves the heights
         navigation = NavigationMap(5, cells, np.zeros(SHAPE, np.uint8), STEP, origin, frame)
@@ -91,6 +95,14 @@ def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, refused,
     assert f"WARNING: {broken}: the chunk at byte" in said(3, "export", a, broken, tmp_path / "m", "--merge").out
     assert "add --merge to merge the maps of several logs" in refused("export", a, other, tmp_path / "out")
     assert "has no catalogue.sqlite" in refused("export", tmp_path, tmp_path / "out", "--merge")
+
+
+@pytest.mark.parametrize(("part", "refused"), [(("", ""), True), (("19.5", ""), True), (("20.0", ""), False)])
+def test_results_with_a_common_part_of_an_input_are_refused(tmp_path, part, refused):
+    first = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, -1, log_digest="d", start="", end="20.0")
+    other = traverse(tmp_path / "b.mcap", 0, 1.0, 4e-4, -1, log_digest="d", start=part[0], end=part[1])
+    with pytest.raises(LogError, match="results of the same input") if refused else nullcontext():
+        merge([first, other], tmp_path / "out")
 
 
 @pytest.mark.slow
