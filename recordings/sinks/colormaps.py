@@ -20,6 +20,11 @@ Rgb = tuple[int, int, int]
 Point = tuple[float, float]
 Legend = Mapping[int, tuple[str, Rgb]]  # code -> name, colour
 
+# Layer -> the upper end of its scale, twice the usual limit, and its unit
+LAYER_SCALES = {
+    "step": (0.4, "m"), "slope": (40.0, "deg"), "steepness": (40.0, "deg"), "roughness": (0.12, "m"),
+    "variance": (0.009, "m²"), "frames": (20.0, "frames"), "contradictions": (4.0, "frames"),
+}  # fmt: skip
 MIN_SAMPLES = 4096  # values that a colour range is found from, where there are so many
 
 UNKNOWN_RGB: Rgb = (46, 47, 54)

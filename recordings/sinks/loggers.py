@@ -40,12 +40,6 @@ from stages.data.rotations import matrix_of
 # Steps of drawn values: to a px of disparity, to a px of sigma, to a metre of depth; the result log has more digits
 DISPARITY_STEPS, SIGMA_STEPS, DEPTH_STEPS = 4, 250, 250
 POINT_STEPS = 256  # to a metre, of points and heights; a power of 2, so that their lower bits are 0
-ALL_CODES = np.arange(256, dtype=np.uint8)
-# Layer -> the upper end of its scale, twice the usual limit, and its unit
-LAYER_SCALES = {
-    "step": (0.4, "m"), "slope": (40.0, "deg"), "steepness": (40.0, "deg"), "roughness": (0.12, "m"),
-    "variance": (0.009, "m²"), "frames": (20.0, "frames"), "contradictions": (4.0, "frames"),
-}  # fmt: skip
 DIFFERENCE_STEPS = 0.25  # the difference of the images is drawn to 4 gray levels
 MAX_DIFFERENCE = 32  # gray levels, the upper end of the scale of the images' difference
 MAX_COST = 255.0  # the upper end of the scales of sums of costs, which are bytes
@@ -115,7 +109,7 @@ def log_disparity(canvas: Canvas, stream: str, disparity: Disparity) -> str:
         _log_superpixels(canvas, stream, disparity)
     shares = {kind: 100.0 * counts[kind] / source.size for kind in (PixelOrigin.PLANE, PixelOrigin.FILLED)}
     parts = (f"{share:.0f} % {kind.name.lower()}" for kind, share in shares.items() if share)
-    share = 100.0 * counts[known(ALL_CODES)].sum() / source.size
+    share = 100.0 * counts[known(np.arange(256))].sum() / source.size
     return f"{stream} {', '.join([f'{share:.0f} % known', *parts])}"
 
 
@@ -294,7 +288,7 @@ def _log_layers(canvas: Canvas, stream: str, terrain: ElevationMap, heights: tup
     """The layers of a terrain. heights: the ends of the scale of elevations, m."""
     layers = terrain.layers if terrain.frame_id == LEVEL_FRAME else colormaps.provenance(terrain)
     for name, layer in layers.items():
-        end, unit = LAYER_SCALES.get(name, (0.0, ""))
+        end, unit = colormaps.LAYER_SCALES.get(name, (0.0, ""))
         picture = colormaps.birds_eye(np.degrees(layer) if unit == "deg" else layer)
         with np.errstate(over="ignore"):  # beyond 65504, such as seconds after 18 hours, a value is infinite
             values = picture.astype(np.float16)
