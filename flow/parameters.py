@@ -90,11 +90,15 @@ class Checked:
 
 
 def check(value: Any, known: Field[Any], given: Any = None) -> None:
-    """Raise ValueError, "must be ...", for a value that the parameter `known` does not take.
+    """Raise ValueError, "must be ...", for a value, or an item of a list, that the parameter `known` does not take.
 
     given: the value as the user wrote it, for the message.
     """
     if value is None and known.default is None:
+        return
+    if isinstance(value, tuple | list) and _kind_of(known).startswith(("tuple", "list")):
+        for item in value:
+            check(item, known)
         return
     low, high, unit, choices = (known.metadata.get(key) for key in ("low", "high", "unit", "choices"))
     shown = _shown(value, unit) if given is None else given

@@ -64,7 +64,8 @@ def check_bare(number: float, unit: str) -> None:
     """Raise ValueError for a number without a unit where `unit` is one of time, length or angle; 0 needs none."""
     units = _WRITTEN.get(UNITS.get(unit, ("", 1.0))[0])
     if units and number and math.isfinite(number):
-        raise ValueError(f"{number:.15g} needs a unit; write {' or '.join(f'{number:.15g} {name}' for name in units)}")
+        shown = f"{100 * number if units == ('%',) and abs(number) <= 1 else number:.15g}"
+        raise ValueError(f"{number:.15g} needs a unit; write {' or '.join(f'{shown} {name}' for name in units)}")
 
 
 def as_written(value: float, unit: str) -> str:

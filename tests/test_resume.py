@@ -224,8 +224,11 @@ def test_what_a_kill_has_left_is_removed_with_the_checkpoint(log, stopped):
     assert names(stopped) == ["nav.mcap", "nav.rrd"]
 
 
-def test_a_changed_module_beside_the_pipeline_is_refused(log, tmp_path):
-    pipeline, module, out = tmp_path / "own.yaml", tmp_path / "beside_resumed.py", tmp_path / "nav.mcap"
+@pytest.mark.parametrize("name", ["beside_resumed.py", "package_resumed/inner/part.py"])
+def test_a_changed_module_beside_the_pipeline_is_refused(log, tmp_path, name):
+    pipeline, module, out = tmp_path / "own.yaml", tmp_path / name, tmp_path / "nav.mcap"
+    module.parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).parent.parent.joinpath("__init__.py").touch()
     pipeline.write_text((SHIPPED / "fast.yaml").read_text())
     module.write_text("VALUE = 1\n")
     options = {"overrides": OVERRIDES, "resume": True}

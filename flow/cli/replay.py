@@ -103,12 +103,12 @@ def replay(
 
 def _modules(pipeline: str | Path) -> str:
     """The digests of the modules beside a pipeline file of the user's own, which may have its stages."""
-    from flow.config.loader import pipeline_file
+    from flow.config.loader import modules_beside, pipeline_file
     from flow.config.templates import SHIPPED
     from recordings.containers.digest import digest_lines
 
-    folder = pipeline_file(pipeline).parent
-    return "" if folder == SHIPPED else "\n".join(digest_lines(sorted(folder.glob("*.py"))))
+    file = pipeline_file(pipeline)
+    return "" if file.parent == SHIPPED else "\n".join(digest_lines(modules_beside(file)))
 
 
 def _about(
@@ -152,7 +152,7 @@ def _progress_bar(total: int | None, hidden: bool) -> Iterator[tuple[Callable[[b
 
 
 def _files(graph: Graph, logs: Sequence[Path]) -> Sequence[Path]:
-    """The files that the product's own source reads, none for another source.
+    """The files of the logs, which the product's own source also finds in folders.
 
     Raises LogError for a file that is already a result, which may contain its inputs.
     """
@@ -161,7 +161,9 @@ def _files(graph: Graph, logs: Sequence[Path]) -> Sequence[Path]:
     from recordings.errors import LogError
     from recordings.scoring.result_log import about_run
 
-    files = [file for file in find_files(logs).files if file.is_file()] if isinstance(graph.source, McapSource) else []
+    if not isinstance(graph.source, McapSource):
+        return [file for file in logs if file.is_file()]
+    files = [file for file in find_files(logs).files if file.is_file()]
     for file in files:
         if about := about_run(file):
             named = about.get("log") or "which it does not name"

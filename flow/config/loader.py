@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flow.config.node_spec import NodeSpec, mapping, place_at_fault, type_name
+from flow.config.node_spec import OWN_PACKAGES, NodeSpec, mapping, place_at_fault, type_name
 from flow.config.overrides import Change, with_settings
 from flow.config.templates import SHIPPED, Expansion, Library, Scope, resolved
 from flow.config.yaml_tree import Value, nearest_or_all, read
@@ -97,6 +97,13 @@ def pipeline_file(name: str | Path, templates: bool = False) -> Path:
         what = "pipeline or template" if templates else "pipeline"
         raise UsageError(f"no {what} '{name}': neither a file nor one of {', '.join(known)}{nearest(name, known)}")
     return known.get(name, Path(name))
+
+
+def modules_beside(file: Path) -> list[Path]:
+    """The modules that a pipeline file of the user's own can name: .py files in its folder and in packages there."""
+    packages = {module.parent for module in file.parent.glob("*/*.py")}
+    own = [package for package in packages if package.name.isidentifier() and package.name not in OWN_PACKAGES]
+    return sorted([*file.parent.glob("*.py"), *(module for package in own for module in package.rglob("*.py"))])
 
 
 def shipped() -> list[str]:
@@ -249,19 +256,19 @@ def _check_streams(sink: Any, entry: NodeSpec, graph: Graph) -> None:
     """Check that the streams in a sink's entry exist, belong to the frames, and have types that it can write."""
     keys = set(getattr(sink, "names_streams", ())) & entry.given().keys()
     for key in keys:
-        for name in entry.item.value[key].plain():
+        for name, place in entry.items_of(key):
             if name not in graph.kinds:
-                raise entry.place_of(key).error(f"there is no stream '{name}'{nearest(str(name), graph.kinds)}")
+                raise place.error(f"there is no stream '{name}'{nearest(str(name), graph.kinds)}")
             if name not in graph.frame_streams:
-                raise entry.place_of(key).error(
+                raise place.error(
                     f"'{name}' does not run on the clock of the frames, '{graph.clock}'; align it first (flow.align)"
                 )
     for key in set(getattr(sink, "names_patterns", ())) & entry.given().keys():
-        for pattern in entry.item.value[key].plain():
+        for pattern, place in entry.items_of(key):
             if not fnmatch.filter(graph.frame_streams, pattern):
                 near = nearest(pattern, graph.frame_streams)
-                raise entry.place_of(key).error(f"no stream of the frames matches '{pattern}'{near}")
+                raise place.error(f"no stream of the frames matches '{pattern}'{near}")
     for name, kind in graph.frame_streams.items() if hasattr(sink, "unwritable") else ():
         if why := sink.unwritable(name, kind):
-            named = [key for key in keys if name in entry.item.value[key].plain()]
-            raise (entry.place_of(named[0]) if named else entry.place).error(why)
+            named = [place for key in keys for item, place in entry.items_of(key) if item == name]
+            raise (named[0] if named else entry.place).error(why)

@@ -18,6 +18,7 @@ from flow.runtime.graph import YamlLocation, hints_of, is_aligner
 from flow.runtime.ledger import failure
 
 MODULES = ("flow.align", "stages", "recordings")  # whose classes a pipeline file names without a path of its own
+OWN_PACKAGES = {module.partition(".")[0] for module in MODULES}
 ROLES = {  # the attributes that a class of that role needs
     "source": ("streams", "open"),
     "sink": ("suffix", "wants", "open", "write", "close"),
@@ -54,6 +55,10 @@ class NodeSpec:
     def place_of(self, key: str) -> YamlLocation:
         """The line of one of its keys."""
         return self.item.value[key].place  # type: ignore[no-any-return]
+
+    def items_of(self, key: str) -> list[tuple[Any, YamlLocation]]:
+        """The items of the list at one of its keys, each with its line."""
+        return [(item.plain(), item.place) for item in self.item.value[key].value]
 
     def given(self, but: Collection[str] = ()) -> dict[str, Value]:
         """Its keys except `use` and those in `but`."""
@@ -148,14 +153,16 @@ def class_at(use: str, place: YamlLocation) -> type:
     raise place.error(f"'{module_name}' has no dataclass '{name}'{nearest(name, known) or _meant(use)}")
 
 
-def _check_origin(name: str, place: YamlLocation) -> None:
-    """Refuse a module that is not the one beside the pipeline file: Python has one module of a name."""
-    file = getattr(sys.modules[name], "__file__", None) or "Python's own"
-    if place.folder is None or name in {module.partition(".")[0] for module in MODULES}:
+def _check_origin(top: str, place: YamlLocation) -> None:
+    """Refuse a module, or one of a package, that is not the one beside the file: Python has one module of a name."""
+    if place.folder is None or top in OWN_PACKAGES:
         return
-    for beside in (place.folder / f"{name}.py", place.folder / name / "__init__.py"):
-        if beside.is_file() and not (Path(file).is_file() and filecmp.cmp(beside, file, shallow=False)):
-            raise place.error(f"the name '{name}' is taken by another module ({file}); rename {beside}")
+    for name in [name for name in sys.modules.copy() if name.partition(".")[0] == top]:
+        file = getattr(sys.modules[name], "__file__", None) or "Python's own"
+        base = place.folder.joinpath(*name.split("."))
+        for beside in (base.with_suffix(".py"), base / "__init__.py"):
+            if beside.is_file() and not (Path(file).is_file() and filecmp.cmp(beside, file, shallow=False)):
+                raise place.error(f"the name '{name}' is taken by another module ({file}); rename {beside}")
 
 
 def _meant(use: str) -> str:

@@ -71,8 +71,9 @@ def read(text: str, at: Callable[[int], YamlLocation]) -> Value:
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         begun = f", {error.context} from line {error.context_mark.line + 1} on" if error.context_mark else ""
-        remedy = "check indentation (spaces, no tabs), brackets and quotes up to here"
-        raise at(line).error(f"not valid YAML: {error.problem}{begun}; {remedy}") from error
+        form = isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError)
+        remedy = "; check indentation (spaces, no tabs), brackets and quotes up to here" if form else ""
+        raise at(line).error(f"not valid YAML: {error.problem}{begun}{remedy}") from error
 
 
 def _located(node: yaml.Node, at: Callable[[int], YamlLocation], loader: yaml.SafeLoader) -> Value:

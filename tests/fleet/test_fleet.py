@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import signal
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -147,6 +148,22 @@ def test_a_name_that_is_too_long_is_a_failure_of_its_log_alone(logs, tmp_path):
     row = run_task(Task(job, tmp_path, Pipeline.of("fast", ()), recording=False, workers=1))
     assert row["state"] == "failed"
     assert "-nav.mcap: File name too long" in row["why"]
+
+
+def test_a_pipeline_takes_the_packages_beside_it_along(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "there"))
+    (tmp_path / "there").mkdir()
+    (tmp_path / "here/travelling/inner").mkdir(parents=True)
+    for name in ("__init__", "inner/__init__"):
+        (tmp_path / f"here/travelling/{name}.py").touch()
+    stage, own = tmp_path / "here/travelling/inner/stage.py", tmp_path / "here/own.yaml"
+    stage.write_text("from stages import Rectify\n")
+    own.write_text(TRAPPED.replace("trap.Trap", "travelling.inner.stage.Rectify"))
+    pipeline = Pipeline.of(str(own), ())
+    copy = Path(pipeline.local())
+    assert (copy.parent / "travelling/inner/stage.py").read_bytes() == stage.read_bytes()
+    stage.write_text("from stages import Rectify  # and more\n")
+    assert Pipeline.of(str(own), ()).digest != pipeline.digest
 
 
 @pytest.mark.parametrize("locked", [False, True])

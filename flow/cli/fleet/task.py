@@ -20,7 +20,7 @@ from flow.cli.fleet.jobs import UNREADABLE, Job
 from flow.cli.fleet.progress import is_progress
 from flow.cli.replay import LIBRARIES, product_version, replay
 from flow.cli.report import by_cause
-from flow.config.loader import load, shipped
+from flow.config.loader import load, modules_beside, shipped
 from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, SinkError, UsageError
@@ -36,7 +36,7 @@ _TRAVELLED = f"roverflow-{os.getuid()}-"  # begins the names of folders of pipel
 
 @dataclass(frozen=True)
 class Pipeline:
-    """A pipeline that travels. name: of a shipped one, or of its file; files: name -> content, of its folder."""
+    """A pipeline that travels. name: of a shipped one, or of its file; files: path in its folder -> content."""
 
     name: str
     files: Mapping[str, bytes]
@@ -45,13 +45,13 @@ class Pipeline:
 
     @classmethod
     def of(cls, name: str, changes: tuple[str, ...]) -> Pipeline:
-        """The pipeline `name`, which `load` accepts; a file takes the .py files beside it along."""
+        """The pipeline `name`, which `load` accepts; a file takes the modules beside it along."""
         named = tuple(digest_lines(getattr(load(name, changes).source, "files", ())))
         if name in shipped():
             return cls(name, {}, changes, named)
         path = Path(name)
-        beside = [path, *sorted(path.parent.glob("*.py"))]
-        small = {file.name: file.read_bytes() for file in beside if file.stat().st_size <= MAX_FILE_BYTES}
+        beside = [file for file in (path, *modules_beside(path)) if file.stat().st_size <= MAX_FILE_BYTES]
+        small = {str(file.relative_to(path.parent)): file.read_bytes() for file in beside}
         return cls(path.name, small, changes, named)
 
     @property
@@ -78,7 +78,8 @@ class Pipeline:
         for name, data in self.files.items():
             file = folder / name
             if not file.exists() or file.read_bytes() != data:
-                partial = file.with_name(f".{name}.{os.getpid()}")
+                file.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                partial = file.with_name(f".{file.name}.{os.getpid()}")
                 partial.write_bytes(data)
                 partial.replace(file)
         return str(folder / self.name)
@@ -87,8 +88,8 @@ class Pipeline:
 def _forget_others(folder: Path) -> None:
     """Forget modules that travelled with other pipelines: a worker that stays has them from an earlier fleet."""
     for name, module in sys.modules.copy().items():  # another thread may import
-        home = Path(getattr(module, "__file__", None) or "").parent
-        if home.name.startswith(_TRAVELLED) and home.name != folder.name:
+        homes = {home.name for home in Path(getattr(module, "__file__", None) or "").parents}
+        if any(home.startswith(_TRAVELLED) and home != folder.name for home in homes):
             del sys.modules[name]
     sys.path[:] = [path for path in sys.path if not Path(path).name.startswith(_TRAVELLED) or path == str(folder)]
 

@@ -140,6 +140,8 @@ def test_a_key_of_a_setting_is_replaced_everywhere_or_in_one_entry(tmp_path, ove
     ("toys.Scale", "toys.Keep", 5, ["Keep is no stage"]),
     ("gain: 2.5", "gian: 2.5", 1, ["no parameter 'gian'", "did you mean 'gain'"]),
     ("toys.Keep}", "toys.Keep, only: [sum, twise]}", 8, ["there is no stream 'twise'", "did you mean 'twice'"]),
+    ("toys.Keep}", "toys.Keep, only: [sum,\n  twise]}", 9, ["there is no stream 'twise'"]),
+    ("2.5}", "*gain}", 1, ["found undefined alias"]),
     ("toys.Keep}", "toys.Keep, only: [sum, level]}", 8,
      ["'level' does not run on the clock of the frames, 'both'; align"]),
     ("  twice:", "  source:", 5, ["'source' cannot name a stream"]),
@@ -312,6 +314,21 @@ def test_stages_may_be_in_the_folder_of_the_pipeline_file(tmp_path):
     assert {node.name: node.use for node in loaded(tmp_path, text).nodes}["twice"] == "beside.Near"
 
 
+RANGED = """
+from dataclasses import dataclass
+from stages.stage import Stage, parameter
+from tests.flow.toys import Couple
+
+@dataclass(frozen=True)
+class Ranged(Stage):
+    widths: tuple[float, ...] = parameter((1.0, 2.0), "widths", unit="m", low=0)
+    share: float = parameter(0.1, "share", unit="share")
+
+    def __call__(self, couple: Couple) -> Couple:
+        return couple
+"""
+
+
 @pytest.mark.parametrize("name", ["near", "statistics"])
 def test_a_module_is_that_beside_the_pipeline_file_or_refused(tmp_path, name):
     text = GOOD.replace("tests.flow.toys.Scale", f"{name}.Near")
@@ -325,6 +342,32 @@ def test_a_module_is_that_beside_the_pipeline_file_or_refused(tmp_path, name):
     taken = rf"toy.yaml:\d+: the name '{name}' is taken by another module \(.*\); rename .*second/{name}.py"
     with pytest.raises(PipelineError, match=taken):
         loaded(tmp_path / "second", text)
+
+
+@pytest.mark.parametrize("init", [True, False])
+def test_a_module_of_a_package_is_that_beside_the_pipeline_file_or_refused(tmp_path, init):
+    name, text = f"package_{init}", GOOD.replace("tests.flow.toys.Scale", f"package_{init}.near.Near")
+    for folder in ("first", "second"):
+        (tmp_path / folder / name).mkdir(parents=True)
+        module = f"from tests.flow.toys import Scale\nclass Near(Scale):\n    folder = '{folder}'\n"
+        (tmp_path / folder / name / "near.py").write_text(module)
+        if init:
+            (tmp_path / folder / name / "__init__.py").touch()
+    assert loaded(tmp_path / "first", text)
+    with pytest.raises(PipelineError, match=rf"the name '{name}.near' is taken by another module \(.*first/"):
+        loaded(tmp_path / "second", text)
+
+
+def test_a_list_may_have_a_range_and_a_share_is_offered_in_percent(tmp_path):
+    (tmp_path / "ranged.py").write_text(RANGED)
+    text = GOOD.replace("tests.flow.toys.Scale, couple: both, factor: 25 cm", "ranged.Ranged, couple: both, %s")
+    text = text.replace(", bad: [1, 2.5]", "")
+    twice = {node.name: node.actor for node in loaded(tmp_path, text % "widths: [1 m, 20 cm]").nodes}["twice"]
+    assert twice.widths == (1.0, 0.2)
+    with pytest.raises(PipelineError, match=r"toy.yaml:5: ranged.Ranged.widths: must be at least 0 m, not -1 m"):
+        loaded(tmp_path, text % "widths: [1 m, -1 m]")
+    with pytest.raises(PipelineError, match=r"ranged.Ranged.share: 0.07 needs a unit; write 7 %"):
+        loaded(tmp_path, text % "share: 0.07")
 
 
 @pytest.mark.parametrize(("value", "unit", "text"), [
