@@ -22,9 +22,9 @@ class FoxgloveWriter(Ros2Writer):
             super().write(topic, message, stamp)
             return
         for known in found:
-            self.add(topic, self._kind(known), stamp, known.SerializeToString(deterministic=True))
+            self.add(topic, self._protobuf_kind(known), stamp, known.SerializeToString(deterministic=True))
 
-    def _kind(self, message: Any) -> MessageKind:
+    def _protobuf_kind(self, message: Any) -> MessageKind:
         name = message.DESCRIPTOR.full_name
         if name not in self._kinds:
             text = build_file_descriptor_set(type(message)).SerializeToString(deterministic=True)

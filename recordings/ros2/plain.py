@@ -37,6 +37,7 @@ def message_of(value: Any, stamp: int, frame_id: str) -> Any:
     if type(value) in _SCALARS:
         return make(_SCALARS[type(value)], data=value)
     if isinstance(value, str):
+        value.encode()  # a UnicodeEncodeError is a ValueError
         return make("std_msgs/msg/String", data=str(value))
     if isinstance(value, Transform):
         return ros2.transform_stamped(value, stamp)
@@ -63,6 +64,7 @@ def _beyond_64_bits(value: Any) -> bool:
 
 
 def _array_message(array: Array, stamp: int, frame_id: str) -> Any:
+    array = array.astype(array.dtype.newbyteorder("="), copy=False)
     if is_points(array):
         return ros2.float_cloud(stamp, frame_id, ("x", "y", "z"), np.ascontiguousarray(array, np.float32))
     if is_image(array):

@@ -233,7 +233,7 @@ def value_limits(layer: Array) -> tuple[float, float]:
     if not known.size:
         return 0.0, 1.0
     low, high = np.percentile(known, (1.0, 99.0), method="nearest").tolist()
-    return low, high if high > low else low + 1.0
+    return low, high if high > low else low + max(1.0, 1e-6 * abs(low))
 
 
 def format_value(value: float) -> str:

@@ -45,7 +45,7 @@ def leaves(value: Any, kind: Any, known: tuple[type, ...] = ()) -> Iterator[Leaf
         for key, item in value.items():
             yield from _below(str(key), item, inner, known)
     elif isinstance(value, tuple | list):
-        yield (), np.asarray(value)
+        yield (), _array(value, kind)
     elif is_dataclass(value) and not isinstance(value, type):
         for name, inner in field_types(type(value)).items():
             yield from _below(name, getattr(value, name), inner, known)
@@ -63,6 +63,16 @@ def _number(value: Any, kind: Any) -> bool | int | float:
         return bool(value)
     is_float = any(isinstance(option, type) and issubclass(option, float | np.floating) for option in _options(kind))
     return int(value) if isinstance(value, numbers.Integral) and not is_float else float(value)
+
+
+def _array(value: Any, kind: Any) -> Any:
+    """A list or tuple as an array of floats where one is annotated, else of what it contains; an empty one of ints."""
+    array = np.asarray(value)
+    items = [item for option in _options(kind) for item in get_args(option) if isinstance(item, type)]
+    if array.dtype.kind in "biuf" and items:
+        is_float = any(issubclass(item, float | np.floating) for item in items)
+        return array.astype(np.float64 if is_float else np.int64 if not array.size else array.dtype, copy=False)
+    return array
 
 
 @lru_cache(maxsize=256)

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from flow.config.loader import load
@@ -100,7 +101,8 @@ def test_numbers_and_texts_become_std_msgs(tmp_path, value, kind, message):
 
 @pytest.mark.parametrize(("dtype", "shape", "encoding"), [
     (np.uint8, (4, 6), "mono8"), (np.uint8, (4, 6, 3), "rgb8"), (np.uint16, (4, 6), "mono16"),
-    (np.float32, (4, 6), "32FC1"), (np.float16, (4, 6), "32FC1"), (bool, (4, 6), "mono8"), (np.int32, (4, 6), "32SC1"),
+    (np.float32, (4, 6), "32FC1"), (">f4", (4, 6), "32FC1"),
+    (np.float16, (4, 6), "32FC1"), (bool, (4, 6), "mono8"), (np.int32, (4, 6), "32SC1"),
 ])  # fmt: skip
 def test_images_become_sensor_msgs_images(tmp_path, dtype, shape, encoding):
     pixels = np.arange(np.prod(shape)).reshape(shape).astype(dtype)
@@ -125,6 +127,15 @@ def test_a_dataclass_becomes_a_topic_per_field(tmp_path):
     assert array_of(read["/nav/own/range_m"]).tolist() == [0.5, 8.0]
 
 
+@pytest.mark.parametrize(("kind", "values", "message"), [
+    (list[int], [[], [1]], "Int64MultiArray"), (list[float], [[1, 2], [], [0.5]], "Float64MultiArray"),
+    (tuple[float, float], [(1, 2), (0.5, 2)], "Float64MultiArray"), (list[bool], [[True], []], "Int64MultiArray"),
+])  # fmt: skip
+def test_the_annotation_of_a_list_decides_its_message(tmp_path, kind, values, message):
+    read = written(tmp_path / "out.mcap", {"own": kind}, *({"own": value} for value in values))["/nav/own"]
+    assert (read.__msgtype__, read.data.tolist()) == (f"std_msgs/msg/{message}", list(values[-1]))
+
+
 def test_an_array_of_more_dimensions_is_read_back_in_its_shape(tmp_path):
     tensor = np.arange(24, dtype=np.int32).reshape(2, 3, 4)
     read = written(tmp_path / "out.mcap", {"own": np.ndarray}, {"own": tensor})["/nav/own"]
@@ -137,6 +148,7 @@ LARGE = "cannot write 'own': a whole number beyond 64 bits has no standard form"
 @pytest.mark.parametrize(("kind", "value", "why"), [
     (dict[str, float], {"a b": 1.0, "a_b": 2.0}, "cannot write both 'own/a b' and 'own/a_b' to /nav/own/a_b"),
     (dict, {"a": b"raw"}, "cannot write 'own/a': a value of type bytes has no standard form"),  # unlike its annotation
+    (str, "\ud800", "cannot write 'own': 'utf-8' codec can't encode"),
     (int, 1 << 63, LARGE), (int, -(1 << 63) - 1, LARGE), (np.ndarray, np.array([1, 1 << 63], np.uint64), LARGE),
 ])  # fmt: skip
 def test_a_value_without_a_message_or_a_topic_is_an_error(tmp_path, kind, value, why):
@@ -178,6 +190,11 @@ def test_a_pipeline_of_own_types_runs(tmp_path, traverse):
     with pytest.raises(LogError, match=r"stream 'diagnostics' is .*/DiagnosticArray, which read_result does not read"):
         next(read_result(out, ["diagnostics"]))
     assert {"/sharpness", "/edges"} <= entities(out.with_suffix(".rrd"))
+    arguments = ("-p", file, "-o", tmp_path / "viewer.mcap", "--no-rrd", "--profile", "foxglove", "--every", FRAMES)
+    assert roverflow("run", traverse, *arguments) == 0
+    with (tmp_path / "viewer.mcap").open("rb") as log:
+        encodings = {channel.topic: channel.message_encoding for _, channel, _ in make_reader(log).iter_messages()}
+    assert (encodings["/nav/sharpness"], encodings["/nav/edges"]) == ("cdr", "protobuf")
 
 
 def test_own_types_are_drawn_field_by_field(tmp_path):
