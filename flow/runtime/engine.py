@@ -359,12 +359,12 @@ class Engine:
             given = {port: frame.values[stream] for port, stream in node.inputs.items()}
             missing = missing_of(given.values())
             value = None if missing else node.actor(**given, **state)
-            if value is None and flushes and self._ending and frame is self._frames[-1]:
+            flushed = value is None and flushes and self._ending and frame is self._frames[-1]
+            if flushed:
                 value, frame.saved = node.actor.flush(**state), None  # its state is not that of a run that goes on
             if value is None and (missing or node.sparse):
                 return missing or Unchanged()
-            node.check(value, given.values(), frame.stamp)
-            return value
+            return node.checked(value, given.values(), frame.stamp, flushed)
 
         large = bool(getattr(node.actor, "large", False))
         return Work(

@@ -31,6 +31,8 @@ def evaluate(
     UsageError
         If the pipeline lacks one of these streams, if another one must be given, as of an aligner, or if a setting
         needs an input that is left out.
+    TypeError, StageError
+        If a stage returns another type, or another stamp than that of the frame.
 
     Examples
     --------
@@ -67,10 +69,13 @@ def evaluate(
         missing = lacking.get(wanted, wanted)
         raise UsageError(f"'{wanted}' needs a stream that only a run makes from a log; give '{missing}'")
     streams, states = dict(given), {} if states is None else states
+    stamp = next((item.stamp for item in given.values() if hasattr(item, "stamp")), None)
     states |= start(node for name, (node, _) in plan.items() if name not in states)
     for name, (node, inputs) in plan.items():
         if streams.keys() >= {*inputs.values()}:
             state = {"state": states[name]} if node.stateful else {}
-            item = node.actor(**{port: streams[stream] for port, stream in inputs.items()}, **state)
-            streams |= {} if item is None else {name: item}
+            ports = {port: streams[stream] for port, stream in inputs.items()}
+            item = node.actor(**ports, **state)
+            if item is not None or not node.sparse:
+                streams[name] = node.checked(item, ports.values(), stamp)
     return streams

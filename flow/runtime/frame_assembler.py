@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from numbers import Integral
+from operator import index
 from typing import Any
 
 from flow.align import Answers, Token
-from flow.contracts import Absent, Event, Loss, LossReason
+from flow.contracts import Absent, Event, Loss, LossReason, StageError, nearest
 from flow.runtime.frame_selection import Every, FrameSelection
-from flow.runtime.graph import Graph
+from flow.runtime.graph import Graph, frozen
 from flow.runtime.ledger import Ledger
 
 SUSPECT_JUMP = 1_000_000_000  # ns; a stamp that gains more than this on the log's clock is suspect
@@ -74,7 +76,8 @@ class _StampCheck:
             message.fault = f"it repeats the stamp of the {self._stream} message before it"
         elif last is not None and stamp < last.item.stamp:
             back = last.item.stamp - stamp
-            message.fault = f"its stamp is {back / 1e6:.1f} ms before that of the {self._stream} message read before it"
+            shown = f"{back / 1e6:.1f} ms" if back >= 100_000 else f"{back} ns"
+            message.fault = f"its stamp is {shown} before that of the {self._stream} message read before it"
             message.fault += SET_BACK if back > DAMAGED_JUMP else ""
         else:
             self._last = message
@@ -93,6 +96,26 @@ class _StampCheck:
         self._suspect, suspect.suspect = None, False
         if valid:
             suspect.fault, self._last = "", suspect
+
+
+def valid_event(event: Any, source: str, streams: Collection[str], log_time: int) -> Event:
+    """An event of a source, or in its place one with the error that is wrong with it.
+
+    streams: those that the source declares; log_time: that of the event before, ns.
+    """
+    try:
+        log_time, stream, item = event
+        log_time = index(log_time)
+    except (TypeError, ValueError):
+        return log_time, "log", StageError(f"{source} gave an event that is not (log time in whole ns, stream, item)")
+    if isinstance(item, Exception):
+        return log_time, stream, item
+    if stream not in streams:
+        meant = nearest(str(stream), streams)
+        return log_time, str(stream), StageError(f"{source} declares no stream {str(stream)!r}{meant}")
+    if not isinstance(getattr(item, "stamp", None), Integral):
+        return log_time, stream, StageError(f"{source} gave an item whose 'stamp' is not in whole ns")
+    return log_time, stream, frozen(item)
 
 
 def _checked(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:

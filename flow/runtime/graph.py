@@ -16,7 +16,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
-from flow.contracts import Sink, StageError, unaliased
+from flow.contracts import Sink, StageError, counted, unaliased
 from flow.errors import PipelineError
 from flow.runtime.ledger import failure
 
@@ -75,28 +75,38 @@ class Node:
         """Whether the actor is a stage that may return None, where a frame has nothing new."""
         return not self.aligns and NoneType in get_args(_returned(type(self.actor)))
 
-    def check(self, value: Any, given: Iterable[Any], stamp: int) -> None:
-        """Refuse a result of another type, or with a stamp of neither the frame nor an input. A flush may be older."""
+    def checked(self, value: Any, given: Iterable[Any], stamp: int | None, flushed: bool = False) -> Any:
+        """A result, read-only; refused if of another type, or with a stamp of neither the frame nor an input.
+
+        flushed: whether it is what the actor kept until the end, which may be older.
+        """
         if why := misfit(value, self.output):
             raise TypeError(f"{self.use} returned {why}")
         stamps = {stamp, None, *(getattr(item, "stamp", None) for item in given)}
-        if getattr(value, "stamp", None) not in stamps and not hasattr(self.actor, "flush"):
+        if getattr(value, "stamp", None) not in stamps and not flushed:
             raise StageError(f"{self.use} returned the stamp {value.stamp} ns, not that of its frame")
-        _freeze(value)
+        return frozen(value)
 
 
-def _freeze(value: Any) -> None:
-    """Make the arrays in a result read-only, so that a stage that keeps one cannot change it under its readers."""
+def frozen(value: Any) -> Any:
+    """An item that its maker cannot change under its readers: its arrays are read-only, a list or dict is a copy."""
     import numpy as np  # which help does not need
 
+    if type(value) is list:
+        return [frozen(part) for part in value]
+    if type(value) is dict:
+        return {key: frozen(part) for key, part in value.items()}
     if isinstance(value, np.ndarray):
-        value.flags.writeable = False
+        array: Any = value
+        while isinstance(array, np.ndarray):  # up to the owner of a view
+            array.flags.writeable, array = False, array.base
     elif isinstance(value, Mapping | tuple | list):
         for part in value.values() if isinstance(value, Mapping) else value:
-            _freeze(part)
+            frozen(part)
     elif is_dataclass(value):
         for one in fields(value):
-            _freeze(getattr(value, one.name, None))
+            frozen(getattr(value, one.name, None))
+    return value
 
 
 @dataclass(frozen=True)
@@ -259,6 +269,8 @@ def accepts(wanted: Any, given: type) -> bool:
     if _is_union(wanted):
         return any(accepts(option, given) for option in get_args(wanted))
     wanted, given = get_origin(wanted) or wanted, get_origin(given) or given
+    if wanted is float and given is int:
+        return True
     return wanted is Any or (isinstance(wanted, type) and issubclass(given, wanted))
 
 
@@ -280,6 +292,8 @@ def misfit(value: Any, kind: Any) -> str:
         fits = isinstance(value, Real if plain is float else plain)
     if not fits:
         return f"{type(value).__name__}, not {plain.__name__}"
+    if isinstance(value, tuple) and parts and parts[-1] is not Ellipsis and len(value) != len(parts):
+        return f"{counted(len(value), 'value')}, not {len(parts)}"
     for name, item, wanted in _contents(value, parts):
         if why := misfit(item, wanted):
             return f"{why}, as {name!r}"

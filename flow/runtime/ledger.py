@@ -19,15 +19,19 @@ FLOW = Path(__file__).resolve().parent.parent
 
 def failure(error: BaseException) -> str:
     """The ledger's sentence about an exception: a StageError as it is, any other with its type, file and line."""
-    log.debug("%s", error, exc_info=error)
+    try:
+        text = " ".join(str(error).split())
+    except Exception:  # of the exception's own class
+        text = "its message cannot be read"
+    log.debug("%s", text, exc_info=error)
     if isinstance(error, StageError):
-        return str(error)
+        return text
     calls = [call for call in extract_tb(error.__traceback__) if not call.filename.startswith("<")]
     outside = [call for call in calls if FLOW not in Path(call.filename).parents]
     # The last line in the file of the stage itself: what its libraries do further down means little to a user.
     own = [call for call in outside if call.filename == outside[0].filename]
     where = f" ({Path(own[-1].filename).name}, line {own[-1].lineno}; --debug shows the traceback)" if own else ""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
+    return f"{type(error).__name__}: {text}{where}"
 
 
 class Ledger:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import pickle
 import resource
 import sys
@@ -14,13 +15,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, cast
 
-from flow.contracts import MAX_WORKERS, Event, Finding, Log, Sink, Verdict
+from flow.contracts import MAX_WORKERS, Event, Finding, Log, Sink, StageError, Verdict, nearest
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.bottleneck import latency, usable_cores
 from flow.runtime.checkpoint import Checkpoint, Checkpoints, check_resumable
 from flow.runtime.engine import Engine
 from flow.runtime.findings import as_dicts, findings, has_fault, warning
-from flow.runtime.frame_assembler import FrameAssembler, ReadyFrame
+from flow.runtime.frame_assembler import FrameAssembler, ReadyFrame, valid_event
 from flow.runtime.frame_selection import Every, FrameSelection
 from flow.runtime.graph import Graph
 from flow.runtime.interrupts import Stop
@@ -42,6 +43,9 @@ class _Outputs:
     @classmethod
     def of(cls, graph: Graph, paths: Mapping[str, Path]) -> _Outputs:
         """The sinks that have a path. A graph's sink is configuration, so each run opens a copy of its own."""
+        known = [use for use, _ in graph.sinks]
+        for use in (use for use in paths if use not in known):
+            raise UsageError(f"the pipeline has no sink '{use}'{nearest(use, known)}")
         sinks = {use: replace(sink) for use, sink in graph.sinks if use in paths}
         kinds = graph.frame_streams.items()
         wanted = {use: [name for name, kind in kinds if sink.wants(name, kind)] for use, sink in sinks.items()}
@@ -84,6 +88,7 @@ class _Outputs:
 
     def close(self, summary: dict[str, Any]) -> None:
         """Close what is open; raises SinkError if any sink has failed."""
+        before = "" if not self.errors else " before it"
         for use in self.opened:
             try:
                 self.sinks[use][0].close(summary)
@@ -95,7 +100,7 @@ class _Outputs:
                 raise cause
             failed = {use for use, _ in self.errors}
             kept = "".join(
-                f"; {self.paths[use]} contains the frames before it" for use in self.opened if use not in failed
+                f"; {self.paths[use]} contains the frames{before}" for use in self.opened if use not in failed
             )
             path = self.paths[use]
             named = "" if str(cause).startswith(f"cannot write {path}: ") else f" could not write {path}"
@@ -109,7 +114,7 @@ def run(
     outputs: Mapping[str, Path],
     *,
     workers: int = 2,
-    every: Every | None = None,
+    every: Every | int | None = None,
     rate: float | None = None,
     about: Mapping[str, str] | None = None,
     stop: Stop | None = None,
@@ -162,10 +167,12 @@ def run(
     SinkError
         An output could not be written. All outputs are closed by then.
     """
-    if not 1 <= workers <= MAX_WORKERS:
-        raise UsageError(f"a run needs 1 to {MAX_WORKERS} workers, not {workers}")
+    if not isinstance(workers, int) or not 1 <= workers <= MAX_WORKERS:
+        raise UsageError(f"a run needs 1 to {MAX_WORKERS} workers, not {workers!r}")
+    if rate is not None and not 0 < rate < math.inf:
+        raise UsageError(f"the rate of a run must be above 0, not {rate!r}")
     graph = with_spare_threads(asked(fitted(graph, log), outputs), log.frames, workers)
-    every = every or Every()
+    every = every if isinstance(every, Every) else Every(1 if every is None else every)
     selection = FrameSelection(every, every.odometry(graph.source.streams, log.missing))
     stop, ledger = stop or Stop(), Ledger()
     resumed = checkpoints.last if checkpoints is not None else None
@@ -174,7 +181,7 @@ def run(
     wall, cpu = time.perf_counter(), time.process_time()
     prepared = Prepass(graph)
     with suppress(_StoppedError):
-        prepared = prepass(graph, lambda *which: (_read(part, stop) for part in log.excerpts(*which)))
+        prepared = prepass(graph, lambda *which: (_read(part, stop, graph) for part in log.excerpts(*which)))
     graph = prepared.graph
     sinks = _Outputs.of(graph, outputs)
     assembler, started, at_end = FrameAssembler(graph, ledger, selection), 0.0, False
@@ -189,7 +196,7 @@ def run(
             started = time.perf_counter() - wall
             if checkpoints is not None and resumed is not None:  # of the outputs that the run writes from now on
                 checkpoints.keep(replace(resumed, states={**resumed.states, **sinks.saved()}))
-            events = _read(log.events(assembler.wanted), stop)
+            events = _read(log.events(assembler.wanted), stop, graph)
             at_end = _feed(assembler.frames(events), assembler, engine, stop, Pace(rate), checkpoints)
     finally:
         engine.finish(stop.abandoning)
@@ -310,13 +317,14 @@ def _keep(engine: Engine, checkpoints: Checkpoints | None) -> None:
         checkpoints.give_up(engine.unsaved)
 
 
-def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
+def _read(events: Iterable[Event], stop: Stop, graph: Graph) -> Iterator[Event]:
     """The events of a log until it ends or the run is stopped; an exception of the source becomes the last event."""
-    log_time, source, broken = 0, iter(events), False
+    log_time, source, broken = 0, None, False
     while not broken:
         try:
             stop.reading = True
-            event = next(source)
+            source = source or iter(events)
+            event = valid_event(next(source), graph.source_use, graph.source.streams, log_time)
         except StopIteration:
             return
         except KeyboardInterrupt:
@@ -324,7 +332,8 @@ def _read(events: Iterable[Event], stop: Stop) -> Iterator[Event]:
                 raise
             raise _StoppedError from None
         except Exception as error:  # the rest of the log is lost; the events before it are kept
-            event, broken = (log_time, "log", error), True
+            mistake = type(error).__module__ == "builtins" and not isinstance(error, OSError)
+            event, broken = (log_time, "log", StageError(failure(error)) if mistake else error), True
         finally:
             stop.reading = False
         if stop.finishing() and not broken:

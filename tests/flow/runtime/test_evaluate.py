@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from flow.config.loader import load
+from flow.contracts import StageError
 from flow.errors import UsageError
 from flow.runtime.evaluate import evaluate
 from tests.flow.toys import Couple, Number, graph
@@ -31,6 +32,13 @@ def test_only_streams_between_those_given_and_the_wanted_one_are_made(tmp_path):
     own = GIVEN | {"twice": Couple(7, 1.0)}  # not that of its input
     assert evaluate(toys, own, "twice") == own
     assert evaluate(toys, own, "sum")["sum"] == Couple(7, 16.0)
+
+
+@pytest.mark.parametrize("stage", ["Liar", "Late"])
+def test_a_result_that_a_run_would_lose_is_an_error(tmp_path, stage):
+    text = OPEN.replace("toys.Either, a: both, b: height", f"toys.{stage}, couple: both")
+    with pytest.raises((TypeError, StageError), match=f"{stage} returned (Text, not Couple|the stamp 8 ns)"):
+        evaluate(graph(tmp_path, text=text), GIVEN, "either")
 
 
 def test_a_state_continues_only_where_it_is_kept(tmp_path):

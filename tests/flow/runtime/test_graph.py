@@ -20,6 +20,7 @@ from tests.flow.toys import Couple
     (np.zeros(2), NDArray[np.uint8], "an array of float64, not of uint8"),
     (np.zeros(2, bool), NDArray[np.uint8], "an array of bool, not of uint8"),
     ({"a": np.zeros(2)}, Mapping[str, NDArray[np.int64]], "an array of float64, not of int64, as 'a'"),
+    ((1.0, 2, 3), tuple[float, int], "3 values, not 2"), ((1.0,), tuple[float, int], "1 value, not 2"),
     (np.zeros(2), NDArray[np.float32], ""), (np.float32(1), float, ""), ((1, "x"), tuple[int, str], ""),
     ({"a": 3}, Mapping[str, float | None], ""), (np.zeros(2), NDArray[Any], ""), ({"a": object()}, dict[str, Any], ""),
 ])  # fmt: skip

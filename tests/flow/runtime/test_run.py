@@ -6,6 +6,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,7 +19,7 @@ from flow.runtime.bottleneck import latency
 from flow.runtime.engine import Engine
 from flow.runtime.interrupts import Stop, interrupts
 from flow.runtime.ledger import Ledger
-from flow.runtime.run import asked, with_spare_threads
+from flow.runtime.run import asked, run, with_spare_threads
 from tests.flow.toys import MS, PIPELINE, Couple, Keep, Log, Number, graph, replayed, replayed_log, sink_of, traverse
 
 
@@ -86,6 +90,15 @@ def test_a_failing_sink_stops_the_run_and_is_still_closed(tmp_path):
     assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
 
 
+@dataclass
+class FailingClose(Keep):
+    """Fails at its end."""
+
+    def close(self, summary: Mapping[str, Any]) -> None:
+        """See above."""
+        raise OSError("disk full")
+
+
 class EndsWith(Log):
     """A log that raises an exception after its events."""
 
@@ -102,6 +115,26 @@ def test_a_log_that_fails_midway_keeps_the_frames_read_before(tmp_path):
     sink, summary = replayed_log(graph(tmp_path), EndsWith(OSError("input/output error"), traverse(5)))
     assert len(sink.values("raised")) == 5
     assert summary["drops"] == {"unreadable": 1}
+
+
+def test_a_mistake_in_a_source_is_named_with_its_line(tmp_path):
+    _, summary = replayed_log(graph(tmp_path), EndsWith(KeyError("left"), traverse(5)))
+    assert "KeyError: 'left' (test_run.py, line" in summary["ledger"][0]["detail"]
+
+
+@pytest.mark.parametrize(("event", "why"), [
+    (None, "gave an event that is not (log time in whole ns, stream, item)"),
+    ((0, "left"), "gave an event that is not"), ((0.5, "left", Number(0, 1.0)), "gave an event that is not"),
+    ((0, "lift", Number(0, 1.0)), "declares no stream 'lift'; did you mean 'left'?"),
+    ((0, "left", object()), "gave an item whose 'stamp' is not in whole ns"),
+    ((0, "left", Number("0", 1.0)), "gave an item whose 'stamp' is not in whole ns"),
+])  # fmt: skip
+def test_an_event_that_is_none_is_lost_alone(tmp_path, event, why):
+    log = Log([])
+    log.events = lambda streams: iter([event, *traverse(3)])
+    sink, summary = replayed_log(graph(tmp_path), log)
+    assert [entry["detail"].partition("Source ")[2][: len(why)] for entry in summary["ledger"]] == [why]
+    assert (summary["drops"], len(sink.values("raised"))) == ({"unreadable": 1}, 3)
 
 
 def test_an_interrupt_that_nobody_takes_for_a_request_ends_the_run(tmp_path):
@@ -450,7 +483,23 @@ def test_an_output_that_fails_at_its_end_makes_the_run_incomplete(tmp_path, monk
     assert caught.value.summary["verdict"] == "INCOMPLETE"
 
 
-def test_an_unprintable_exception_is_not_reported_as_a_sink_error(tmp_path, monkeypatch):
+def test_a_failing_close_says_what_the_other_output_contains(tmp_path, monkeypatch):
+    text = PIPELINE + "  - {use: tests.flow.runtime.test_run.FailingClose}\n"
+    pipeline, paths = graph(tmp_path, text=text), {"tests.flow.toys.Keep": Path("a")}
+    paths |= {"tests.flow.runtime.test_run.FailingClose": Path("b")}
+    with pytest.raises(SinkError, match=r"could not write b: disk full; a contains the frames$"):
+        run(pipeline, Log(traverse(3)), paths)
+    with pytest.raises(UsageError, match=r"has no sink 'tests.flow.toys.Kept'; did you mean 'tests.flow.toys.Keep'"):
+        run(pipeline, Log(traverse(3)), {"tests.flow.toys.Kept": Path("a")})
+
+
+@pytest.mark.parametrize("options", [{"workers": 1.5}, {"rate": 0}, {"rate": float("nan")}, {"every": 0}])
+def test_an_argument_that_is_out_of_range_is_refused(tmp_path, options):
+    with pytest.raises((UsageError, ValueError), match=r"workers, not 1\.5|must be (above 0|at least 1)"):
+        replayed(graph(tmp_path), traverse(3), **options)
+
+
+def test_an_unprintable_exception_loses_one_stream_of_its_frame(tmp_path, monkeypatch):
     class UnprintableError(Exception):
         def __str__(self):
             raise RuntimeError("no words for it")
@@ -460,6 +509,6 @@ def test_an_unprintable_exception_is_not_reported_as_a_sink_error(tmp_path, monk
 
     pipeline = graph(tmp_path)
     monkeypatch.setattr("tests.flow.toys.Scale.__call__", fail)
-    with pytest.raises(RuntimeError, match="no words for it"):
-        replayed(pipeline, traverse(3))
-    assert sink_of(pipeline).summary["verdict"] == "INCOMPLETE"
+    _, summary = replayed(pipeline, traverse(3))
+    assert summary["drops"] == {"failed": 6}
+    assert "UnprintableError: its message cannot be read (test_run.py, line" in summary["ledger"][0]["detail"]

@@ -51,6 +51,15 @@ class Dense(EachFourth):
 
 
 @dataclass(frozen=True)
+class Stale(EachFourth):
+    """Returns the stamp of another frame."""
+
+    def __call__(self, couple: Couple, *, state: list[Couple]) -> Couple | None:
+        """See above."""
+        return Couple(couple.stamp + 1, 0.0)
+
+
+@dataclass(frozen=True)
 class Stateless:
     """Keeps nothing that it could flush."""
 
@@ -77,6 +86,12 @@ def test_frames_without_anything_new_are_whole(tmp_path, workers, frames, due):
     assert (summary["verdict"], summary["frames_out"], summary["ledger"]) == ("COMPLETE", frames, [])
     for record in sink.records:
         assert record.unchanged == (frozenset() if record.index in due else {"fourth", "next"})
+
+
+def test_only_a_flush_may_have_another_stamp_than_the_frame(tmp_path):
+    _, summary = replayed(graph(tmp_path, text=PIPELINE.replace("EachFourth", "Stale")), traverse(3))
+    assert summary["drops"] == {"failed": 3}
+    assert "Stale returned the stamp 1 ns, not that of its frame" in summary["ledger"][0]["detail"]
 
 
 def test_the_last_frame_flushes_even_if_it_lost_its_input(tmp_path, monkeypatch):

@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from flow.config.loader import load
 from flow.errors import PipelineError
 from flow.runtime.run import run
 from tests.conftest import FRAMES, mcap_rows, slow
-from tests.flow.toys import PIPELINE, Couple, Log, graph
+from tests.flow.toys import PIPELINE, Couple, Log, graph, replayed
 from tests.flow.toys import traverse as numbers
 
 
@@ -125,14 +126,49 @@ class Sums:
 
 
 @dataclass(frozen=True)
+class Views:
+    """Returns a view of its state."""
+
+    def start(self) -> Any:
+        """The sum."""
+        return np.zeros(3)
+
+    def __call__(self, couple: Couple, *, state: Any) -> NDArray[np.float64]:
+        """The first of three."""
+        state += couple.value
+        return state[:1]  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Returns its state."""
+
+    def start(self) -> dict[str, list[int]]:
+        """No frame."""
+        return {"frames": []}
+
+    def __call__(self, couple: Couple, *, state: dict[str, list[int]]) -> dict[str, list[int]]:
+        """The frames so far."""
+        state["frames"].append(couple.stamp)
+        return state
+
+
+@dataclass(frozen=True)
 class Own:
     """A type with an array."""
 
     values: Any
 
 
-def test_a_stage_cannot_change_an_array_that_it_has_returned(tmp_path):
-    text = TOYS.replace("tests.flow.toys.Total", "tests.flow.runtime.test_state.Sums")
+def test_a_list_or_dict_that_a_stage_returns_is_a_copy(tmp_path):
+    text = PIPELINE.replace("tests.flow.toys.Total", "tests.flow.runtime.test_state.Counts")
+    sink, _ = replayed(graph(tmp_path, text=text), numbers(5), workers=4)
+    assert [len(record.items["total"]["frames"]) for record in sink.records] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("stage", ["Sums", "Views"])
+def test_a_stage_cannot_change_an_array_that_it_has_returned(tmp_path, stage):
+    text = TOYS.replace("tests.flow.toys.Total", f"tests.flow.runtime.test_state.{stage}")
     pipeline = graph(tmp_path, text=text)
     ((use, _),) = pipeline.sinks
     summary = run(pipeline, Log(numbers(3)), {use: tmp_path / "out.txt"})
