@@ -89,7 +89,10 @@ def report(summary: dict[str, Any], compiled: bool = False) -> None:
     if line := bottleneck_line(summary["bottleneck"]):
         say(f"  {line}")
     for path in summary["withheld"]:
-        say(f"  {path} was not written because the run produced no results. --summary FILE lists the losses.")
+        losses = (
+            " --summary FILE lists the losses." if summary["ledger"] else " Nothing was lost: the log has no frame."
+        )
+        say(f"  {path} was not written because the run produced no results.{losses}")
     for path in map(Path, summary["outputs"]):
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")
     for line in [line for part in found for line in lines(part, Severity.WARNING)]:

@@ -1,7 +1,7 @@
 """The ledger: an entry for every lost message and frame, with stream, stamp, stage and reason.
 
-Nothing is dropped without an entry. A run is COMPLETE if there is none, no stage found a fault, its log was read to
-the end and all outputs were written.
+Nothing is dropped without an entry. A run is COMPLETE if there is none, there was a frame, no stage found a fault, its
+log was read to the end and all outputs were written.
 """
 
 from __future__ import annotations

@@ -206,7 +206,8 @@ def run(
         times |= {"cpu_seconds": time.process_time() - cpu, "survey_cpu_seconds": prepared.cpu_seconds}
         found = _notes(log, graph) | findings(graph, engine.states, prepared.findings)
         faulty = has_fault(found) or has_fault(prepared.findings)
-        complete = at_end and not faulty and engine.complete == engine.admitted and not len(ledger) and not sinks.errors
+        whole = 0 < engine.admitted == engine.complete and not len(ledger)
+        complete = at_end and whole and not faulty and not sinks.errors
         sinks.discard(only_empty=engine.through > 0)
         summary = {
             "verdict": str(Verdict.COMPLETE if complete else Verdict.INCOMPLETE),

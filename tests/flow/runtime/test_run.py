@@ -122,6 +122,11 @@ def test_a_mistake_in_a_source_is_named_with_its_line(tmp_path):
     assert "KeyError: 'left' (test_run.py, line" in summary["ledger"][0]["detail"]
 
 
+def test_a_run_without_a_frame_is_not_complete(tmp_path):
+    _, summary = replayed(graph(tmp_path), [])
+    assert (summary["verdict"], summary["frames_in"], summary["ledger"]) == ("INCOMPLETE", 0, [])
+
+
 @pytest.mark.parametrize(("event", "why"), [
     (None, "gave an event that is not (log time in whole ns, stream, item)"),
     ((0, "left"), "gave an event that is not"), ((0.5, "left", Number(0, 1.0)), "gave an event that is not"),
