@@ -126,7 +126,7 @@ class PairState:
         """The log has ended."""
         for port, queue in self.waiting.items():
             while queue:
-                yield self._unmatched(port, "the log ended before its partner came")
+                yield self._unmatched(port, "the part of the log that was read ended before its partner came")
 
     def _unmatched(self, port: str, waited: str = "") -> Loss:
         """Give up the message of `port` that waits longest. waited: for how long, in words, if it waited to a limit."""

@@ -21,8 +21,10 @@ class Rover(Checked):
     footprint: float = parameter(1.0, "width and length of the rover", unit="m", low=0.05, high=20.0)
     wheel_track: float = parameter(1.0, "distance between left and right wheels", unit="m", low=0.05, high=20.0)
     wheel: float = parameter(0.3, "diameter of a wheel", unit="m", low=0.05, high=5.0)
-    max_step: float = parameter(0.2, "highest step that is not a hazard", unit="m", low=0.01)
-    ground_clearance: float = parameter(0.25, "height of the rover's belly above the ground", unit="m", low=0.01)
+    max_step: float = parameter(0.2, "highest step that is not a hazard", unit="m", low=0.01, high=20.0)
+    ground_clearance: float = parameter(
+        0.25, "height of the rover's belly above the ground", unit="m", low=0.01, high=20.0
+    )
     max_slope: float = parameter(
         math.radians(20), "steepest ground that is not a hazard", unit="rad", low=0.0, high=math.radians(89)
     )

@@ -81,7 +81,9 @@ def test_messages_that_wait_for_a_partner_are_bounded():
     lefts = [("left", at * MS, 1.0) for at in range(8)]
     answers = pairing(*lefts, max_waiting=5)
     waited = "no partner among the next 5 messages (stereo.max_waiting)"
-    assert [answer.detail for answer in answers] == [waited] * 3 + ["the log ended before its partner came"] * 5
+    assert [answer.detail for answer in answers] == [waited] * 3 + [
+        "the part of the log that was read ended before its partner came"
+    ] * 5
 
 
 def test_partners_logged_more_than_a_second_late_are_paired():

@@ -111,6 +111,12 @@ def test_a_limit_that_level_ground_would_reach_is_refused(limit):
     Binarise(method="absolute", rover=rover)
 
 
+@pytest.mark.parametrize("limit", ["max_step", "ground_clearance"])
+def test_a_limit_that_no_rover_has_is_refused(limit):
+    with pytest.raises(ValueError, match=rf"Rover.{limit} must be at most 20 m, not 1e\+99 m"):
+        Rover(**{limit: 1e99})
+
+
 def test_a_plane_beyond_the_slope_limit_is_a_hazard_for_its_slope():
     result = decided(map_of(np.tan(np.deg2rad(20.2)) * X))
     assert (result.reason == CellReason.SLOPE).all()
