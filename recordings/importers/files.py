@@ -29,20 +29,33 @@ def read_bytes(path: Path) -> bytes:
         raise LogError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def read_lines(path: Path) -> Iterator[tuple[str, str]]:
-    """Each line with content of a text file, after its place in words; without comments (# and %). Raises LogError."""
+def read_lines(path: Path, listed: bool = False) -> Iterator[tuple[str, str]]:
+    """Each line with content of a text file, after its place in words; without comments (# and %).
+
+    listed: the lines are of images by number, so one without content between them is an error. Raises LogError.
+    """
     try:
         text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise LogError(f"{path} is not a text file; correct it or get it again") from error
+    gap, begun = 0, False
     for number, line in enumerate(text.splitlines(), 1):
         if (content := line.strip()) and content[0] not in "#%":
+            if listed and gap:
+                raise LogError(
+                    f"{path}, line {gap} has no content, but lines are counted as images are; fill or remove it"
+                )
+            begun = True
             yield f"{path}, line {number}", content
+        elif begun or not content:
+            gap = gap or number
 
 
-def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterator[tuple[str, list[str]]]:
-    """The columns of each line, after its place in words; separator: None is blanks. Raises LogError for too few."""
-    for where, line in read_lines(path):
+def read_rows(
+    path: Path, columns: int, separator: str | None = None, listed: bool = False
+) -> Iterator[tuple[str, list[str]]]:
+    """The columns of each line, as of `read_lines`; separator: None is blanks. Raises LogError for too few."""
+    for where, line in read_lines(path, listed):
         row = [value.strip() for value in line.rstrip(f"{separator or ''} ").split(separator)]
         if len(row) < columns:
             raise LogError(f"{where} has only {len(row)} of {columns} columns; correct it or get it again")
@@ -52,6 +65,8 @@ def read_rows(path: Path, columns: int, separator: str | None = None) -> Iterato
 def numbers_of(values: list[str], where: str) -> Array:
     """The values as float64. Raises LogError if one is not a finite number."""
     try:
+        if grouped := [value for value in values if "_" in value]:  # float() takes 1_4 for 14
+            raise ValueError(grouped[0])
         found = np.array([float(value) for value in values])
     except ValueError as error:
         raise LogError(f"{where} contains what is not a number ({error}); correct it or get it again") from error

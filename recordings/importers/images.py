@@ -106,7 +106,7 @@ def import_images(
     Returns
     -------
     tuple[int, list[str]]
-        The number of frames, and notes about the pairs that are left out.
+        The number of frames, and notes about what is left out.
 
     Raises
     ------
@@ -120,6 +120,8 @@ def import_images(
     if not 0 < rate <= 1e9 or FIRST_STAMP + (len(left) + 1) * 1e9 / rate >= LAST_STAMP:
         pairs = counted(len(left), "pair")
         raise LogError(f"the rate of {pairs} must be above 0 and at most 1e9 Hz, not {rate:g}; stamps end in 2038")
+    if attitudes is not None and roll:
+        raise LogError(f"{attitudes} is in place of a roll of {roll:g} degrees; give its rows the column 'roll'")
     if not abs(pitch_down) <= 90 or not abs(roll) <= 180:
         raise LogError(
             f"a pitch of {pitch_down} and a roll of {roll} degrees are impossible; give at most 90 and 180 degrees"
@@ -136,11 +138,11 @@ def import_images(
         rectified, (cameras, beside_it) = False, _raw(files, (left[0], right[0]))
     numbered = enumerate(zip(left, right, strict=True))
     paired = [ImagePair(FIRST_STAMP + number * period, *pair) for number, pair in numbered]
-    moving = None
+    moving, notes = None, list[str]()
     if attitudes is not None:
-        paired, moving = read_attitudes(attitudes, paired, rig)
+        paired, moving = read_attitudes(attitudes, paired, rig, notes)
     recording = standing(paired, cameras, beside_it, rig, moving)
-    return write_recording(replace(recording, rectified=rectified), out, progress, report)
+    return write_recording(replace(recording, rectified=rectified, notes=notes), out, progress, report)
 
 
 def standing(

@@ -59,7 +59,7 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     folders = [source / f"image_{camera}" / "data" for camera in (left, right)]
     listed = [
         ImagePair(from_date(line, where), folders[0] / f"{number:010d}.png", folders[1] / f"{number:010d}.png")
-        for number, (where, line) in enumerate(read_lines(source / f"image_{left}" / "timestamps.txt"))
+        for number, (where, line) in enumerate(read_lines(source / f"image_{left}" / "timestamps.txt", listed=True))
     ]
     pairs = sorted(existing(listed, "timestamps.txt", notes), key=lambda pair: pair.stamp)
     camera_from_imu = _rigid(velo_to_cam, "R", "T") @ _rigid(imu_to_velo, "R", "T")
@@ -126,7 +126,7 @@ def _raw(values: dict[str, Array], left: str, right: str) -> tuple[Any, Transfor
 def _readings(oxts: Path) -> tuple[list[int], Array]:
     """Stamps, and (n, 6) latitude and longitude, deg, altitude, m, roll, pitch and yaw, rad, of the INS."""
     rows, stamps = [], []
-    for number, (where, line) in enumerate(read_lines(oxts / "timestamps.txt")):
+    for number, (where, line) in enumerate(read_lines(oxts / "timestamps.txt", listed=True)):
         if (path := oxts / "data" / f"{number:010d}.txt").exists():
             stamps.append(from_date(line, where))
             rows.append(next((numbers_of(text.split()[:6], place) for place, text in read_lines(path)), np.zeros(0)))

@@ -37,7 +37,7 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     rig.need("KITTI's odometry benchmark", "height", "pitch_down")
     mount, cameras = rig.mount, (2, 3) if color else (0, 1)
     assert mount is not None
-    stamps = [from_seconds(line, where, FIRST_STAMP) for where, line in read_lines(source / "times.txt")]
+    stamps = [from_seconds(line, where, FIRST_STAMP) for where, line in read_lines(source / "times.txt", listed=True)]
     folders = [source / f"image_{camera}" for camera in cameras]
     listed = [
         ImagePair(stamp, folders[0] / f"{number:06d}.png", folders[1] / f"{number:06d}.png")
@@ -104,7 +104,7 @@ def _projections(path: Path) -> list[Array]:
 def _track(path: Path, stamps: list[int], mount: Transform, shift: Array) -> Track:
     """The poses of the left camera, in a world in which base_link is level in the first frame."""
     poses = []
-    for (where, line), stamp in zip(read_lines(path), stamps, strict=False):
+    for (where, line), stamp in zip(read_lines(path, listed=True), stamps, strict=False):
         row = numbers_of(line.split(), where)
         if row.size != 12:
             raise LogError(f"{where} has {row.size} numbers, not 12; download it again")

@@ -70,7 +70,7 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
 def _track(path: Path) -> Track:
     """The poses of the left camera, one a line."""
     poses = []
-    for number, (where, row) in enumerate(read_rows(path, 7)):
+    for number, (where, row) in enumerate(read_rows(path, 7, listed=True)):
         values = numbers_of(row[:7], where)
         turn = _DOWN @ rotation_of(values[3:], where).as_matrix() @ _DOWN @ BODY_FROM_OPTICAL
         poses.append((FIRST_STAMP + number * PERIOD_NS, _DOWN @ values[:3], Rotation.from_matrix(turn)))

@@ -21,6 +21,7 @@ from tests.conftest import data_folder, roverflow
 from tests.recordings.importers.simulated import EXACT, assert_same, own_log, seen_in, write_images
 from tests.recordings.sample_log import frame_of, picture, stamps_in
 
+SIDES = ("left", "right")
 CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
 
 
@@ -271,10 +272,33 @@ def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
     ("name,pitch_down\n1-left,3\n", "has no row for 0-left.png"),
     ("name,pitch_down,roll\n0-left,3\n", "line 2 has 2 columns, but the first line names 3"),
     ("name,pitch_down\n0-left,down\n", "line 2 contains what is not a number"),
+    ("name,pitch_down\n0-left,1_4\n", "line 2 contains what is not a number"),
     ("name,pitch_down\n0-left,200\n", "line 2: pitch_down must be at most 180 deg"),
-], ids=range(6))  # fmt: skip
+    ("name,pitch_down,pitch_down\n0-left,3,4\n", "has the column 'pitch_down' twice; its first line must name"),
+    ("name,pitch_down\n0-left,3\n0-left.png,4\n", "line 3 has another attitude of .*0-left.png; give one row for"),
+], ids=range(9))  # fmt: skip
 def test_attitudes_that_are_none_are_refused(tmp_path, text, words):
     (tmp_path / "attitudes.csv").write_text(text)
     with pytest.raises(LogError, match=words):
         imported(tmp_path, make_pairs(tmp_path, 1), attitudes=tmp_path / "attitudes.csv")
     assert not list(tmp_path.glob("out*"))
+
+
+def test_a_row_of_attitudes_names_one_image_by_its_folder_where_names_repeat(tmp_path):
+    left, right = ([save(tmp_path / f"site{n}" / f"{side}.png", picture(n)) for n in (1, 2)] for side in SIDES)
+    (attitudes := tmp_path / "attitudes.csv").write_text(
+        "name,pitch_down\nsite2/left,40\nsite1/left.png,14\nsite3/left,3\n"
+    )
+    frames, notes = imported(tmp_path, (left, right), attitudes=attitudes)
+    assert (frames, notes) == (2, ["attitudes.csv has 1 row of images that do not exist, first: site3/left"])
+    pitches = [np.degrees(np.arcsin(-frame.mount.rotation[2, 2])) for frame in seen_in(tmp_path / "out.mcap")]
+    np.testing.assert_allclose(pitches, [14, 40])
+    attitudes.write_text("name,pitch_down\nleft,14\n")
+    with pytest.raises(LogError, match=r"line 2: 'left' may be .*site1/left\.png and .*site2/left\.png; write the"):
+        imported(tmp_path, (left, right), attitudes=attitudes)
+
+
+def test_a_roll_beside_a_file_of_attitudes_is_refused(tmp_path):
+    (attitudes := tmp_path / "attitudes.csv").write_text("name,pitch_down\n0-left,14\n")
+    with pytest.raises(LogError, match="is in place of a roll of 30 degrees; give its rows the column 'roll'"):
+        imported(tmp_path, make_pairs(tmp_path, 1), attitudes=attitudes, roll=30)
