@@ -57,7 +57,7 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
 def _pairs(source: Path, stamps: dict[int, int], notes: list[str]) -> list[ImagePair]:
     """The pairs that have a time."""
     pairs, without = [], 0
-    for left, right in zip(*pair_images(source), strict=True):
+    for left, right in zip(*pair_images(source, notes), strict=True):
         if "raw" in left.name:
             raise LogError(f"{left} is not rectified; give the folder of a rectified set")
         number = re.search(r"(\d+)$", left.stem)

@@ -76,7 +76,7 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
 
 
 def _pairs(folder: Path, notes: list[str]) -> list[ImagePair]:
-    files = [{file.stem[:-2]: file for file in folder.glob(f"*_{side}.png")} for side in "01"]
+    files = [{file.stem[:-2]: file for file in folder.glob(f"[!.]*_{side}.png")} for side in "01"]
     pairs = paired(files, "time", folder, notes)
     return [ImagePair(_time(name[len(PREFIX) :], str(left)), left, right) for name, left, right in pairs]
 

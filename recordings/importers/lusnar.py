@@ -27,7 +27,7 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     if not folders[0].is_dir():
         raise LogError(f"{source} has no folder image1/RGB; give the folder of one scene")
     rig.need("LuSNAR", "height", "pitch_down", *AXES)
-    files = [{file.name: file for file in folder.glob("*.png")} for folder in folders]
+    files = [{file.name: file for file in folder.glob("[!.]*.png")} for folder in folders]
     notes = ["the tilt is derived from the poses, as the data set has no tilt sensor"]
     found = paired(files, "stamp", source, notes)
     pairs = [ImagePair(nanoseconds(left.stem, str(left)), left, right) for _, left, right in found]

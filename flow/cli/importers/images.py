@@ -34,7 +34,8 @@ def run(options: argparse.Namespace) -> int:
     from recordings.importers.images import import_images
     from recordings.importers.pairing import pair_images
 
-    left, right = pair_images(options.source)
+    found: list[str] = []
+    left, right = pair_images(options.source, found)
     files = [*options.calibration, *filter(None, [options.attitudes])]
     check_outputs({"input log": options.out}, [*files, *left, *right])
     given = {name: getattr(options, name) for name in ("roll", "height", "rate", "attitudes")}
@@ -43,4 +44,4 @@ def run(options: argparse.Namespace) -> int:
         frames, notes = import_images(
             left, right, options.calibration, options.out, **given, progress=shown[0], report=shown[1]
         )
-    return complete(options, frames, notes)
+    return complete(options, frames, [*found, *notes])

@@ -1,5 +1,6 @@
 """Image files become a rover log with the given camera attitude."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ CALIBRATION = {"fx": 20.0, "cx": 11.5, "cy": 7.5, "baseline": 0.25}
 
 
 def save(path: Path, pixels: np.ndarray) -> Path:
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
     return path
 
@@ -96,7 +97,7 @@ def test_the_camera_has_the_given_attitude(tmp_path, pitch_down, roll):
 def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
     for name in names:
         save(tmp_path / name, picture(0))
-    found = pair_images(tmp_path)
+    found = pair_images(tmp_path, [])
     assert [path.relative_to(tmp_path).as_posix() for path in found[0]] == left
     assert len(found[1]) == len(left)
     assert not set(found[0]) & set(found[1])
@@ -109,12 +110,41 @@ def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
     (["0.png", "1.png", "2.png", "3.png"], r"contains no image pairs, only 4 images"),
     (["0/0.png", "0/1.png", "1/0.png", "1/1.png"], r"contains no image pairs, only 4 images"),
     (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
+    (["front_left_1.png", "front_right_1.png", "rear_left_2.png", "rear_right_2.png"],
+     r"several cameras \(front_left_1\.png, rear_left_2\.png\); give a folder with those of one"),
+    (["left_1.png", "right_1.png", "left_1_rect.png", "right_1_rect.png"], "several cameras"),
+    (["front/left_1.png", "front/right_1.png", "rear/left_1.png", "rear/right_1.png"], "several cameras"),
+    (["left/data/1.png", "right/data/1.png"], r"only 0 images in it and its folders \(deeper ones are not searched\)"),
+    (["left/0.png", "right/0.jpg"], r"as left/0\.png and right/0\.jpg have different endings"),
+    (["left_mask.png", "right_mask.png"], "as the names of all 2 images contain mask/disp/.*/gt; rename"),
 ])  # fmt: skip
 def test_no_image_is_left_out_silently(tmp_path, names, sentence):
     for name in names:
         save(tmp_path / name, picture(0))
     with pytest.raises(LogError, match=sentence):
-        pair_images(tmp_path)
+        pair_images(tmp_path, [])
+
+
+def test_images_that_are_left_out_or_may_be_of_several_cameras_are_noted(tmp_path):
+    for name in ("sand", "mask_sand", "rock", "rock_2"):
+        for side in SIDES:
+            save(tmp_path / side / f"{name}.png", picture(0))
+    left, _ = pair_images(tmp_path, notes := [])
+    assert [path.stem for path in left] == ["rock", "rock_2", "sand"]
+    assert notes == [
+        "2 images left out, as the names contain mask/disp/disparity/depth/truth/gt, first: left/mask_sand.png",
+        "all pairs are taken as those of one camera, with 2 kinds of names, such as left/rock.png, left/sand.png",
+    ]
+
+
+def test_hidden_files_and_pipes_are_no_images(tmp_path):
+    make_pairs(tmp_path, 1)
+    (tmp_path / "._0-left.png").write_bytes(b"of macOS")
+    (tmp_path / "left").mkdir()
+    os.mkfifo(tmp_path / "left" / "1.png")
+    notes: list[str] = []
+    assert [[path.name for path in side] for side in pair_images(tmp_path, notes)] == [["0-left.png"], ["0-right.png"]]
+    assert notes == []
 
 
 @pytest.mark.parametrize(("change", "sentence"), [
