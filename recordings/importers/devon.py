@@ -13,7 +13,7 @@ import numpy as np
 
 from flow.contracts import counted
 from recordings.errors import LogError
-from recordings.importers.files import from_date, numbers_of, read_rows
+from recordings.importers.files import firsts, from_date, numbers_of, read_rows
 from recordings.importers.pairing import pair_images
 from recordings.importers.recording import BASE, IMU, ImagePair, ImportedRecording, Logged, common_size
 from recordings.importers.rig import INCLINOMETER, LENS, Rig
@@ -40,9 +40,10 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
         raise LogError(f"there is no {places[0] / TIMES}; give --logs, or use import images for pairs without times")
     rig.need("the Devon Island data set", "height", "pitch_down", *INCLINOMETER)
     notes: list[str] = []
-    stamps = {
-        int(row[0]): from_date(row[1], where) for where, row in read_rows(folder / TIMES, 2) if row[0].isdecimal()
-    }
+    times = [
+        (int(row[0]), from_date(row[1], where)) for where, row in read_rows(folder / TIMES, 2) if row[0].isdecimal()
+    ]
+    stamps = firsts(times, "number", TIMES, notes)
     pairs = _pairs(source, stamps, notes)
     width, height = common_size(pairs)
     if width not in LENSES:
@@ -50,7 +51,7 @@ def read_devon(source: Path, rig: Rig, logs: Path | None = None) -> ImportedReco
     focal, centre = LENSES.get(width, (1.0, (0.0, 0.0)))
     camera = rig.camera((width, height), focal, BASELINE, centre)
     inclinometer = Transform(BASE, IMU, np.eye(3), np.zeros(3))
-    tilts = [_tilts(folder, rig, stamps)]
+    tilts = [_tilts(folder, rig, stamps, pairs, notes)]
     return ImportedRecording.of_rectified(camera, pairs, rig.mount, inclinometer, sensors=tilts, notes=notes)
 
 
@@ -73,8 +74,8 @@ def _pairs(source: Path, stamps: dict[int, int], notes: list[str]) -> list[Image
     return sorted(pairs, key=lambda pair: pair.stamp)
 
 
-def _tilts(folder: Path, rig: Rig, stamps: dict[int, int]) -> list[Logged]:
-    """The readings of the inclinometer; those of images without a time are not used."""
+def _tilts(folder: Path, rig: Rig, stamps: dict[int, int], pairs: list[ImagePair], notes: list[str]) -> list[Logged]:
+    """The readings of the inclinometer; those of images without a time are not used. A note counts pairs without."""
     path = next((path for name in (SAMPLED, RAW) if (path := folder / name).exists()), None)
     if path is None:
         raise LogError(f"there is neither {SAMPLED} nor {RAW} in {folder}; download the logs again")
@@ -91,4 +92,9 @@ def _tilts(folder: Path, rig: Rig, stamps: dict[int, int]) -> list[Logged]:
         except LogError as error:
             raise LogError(f"{where}: {error}") from error
         found.append((stamp, "/inclinometer", imu(stamp, IMU, upright(up))))
+    if not found:
+        raise LogError(f"{path} contains no reading of an image with a time; download it again")
+    without = {pair.stamp for pair in pairs}.difference(stamp for stamp, *_ in found)
+    if without and path.name == SAMPLED:
+        notes.append(f"{SAMPLED} has no reading for {counted(len(without), 'pair')}")
     return sorted(found, key=lambda item: item[0])

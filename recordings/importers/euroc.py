@@ -16,7 +16,8 @@ from flow.contracts import counted
 from recordings.calibration.formats import read_calibration
 from recordings.calibration.yaml_files import numbers, read_yaml
 from recordings.errors import LogError
-from recordings.importers.files import nanoseconds, numbers_of, read_rows, rotation_of
+from recordings.importers.files import firsts, nanoseconds, numbers_of, read_rows, rotation_of
+from recordings.importers.pairing import SUFFIXES
 from recordings.importers.recording import (
     IMU,
     LEFT,
@@ -75,22 +76,33 @@ def _pairs(folder: Path, notes: list[str]) -> list[ImagePair]:
     """The pairs of equal stamps of which both files exist; notes about the others."""
     found: list[dict[int, Path]] = []
     for camera in CAMERAS:
-        listed = {
-            nanoseconds(row[0], where): folder / camera / "data" / row[1]
-            for where, row in read_rows(folder / camera / "data.csv", 2, ",")
-        }
-        files = set((folder / camera / "data").glob("*"))  # any name may be listed, also one that no file can have
+        data, table = folder / camera / "data", folder / camera / "data.csv"
+        rows = [(nanoseconds(row[0], where), data / row[1]) for where, row in read_rows(table, 2, ",")]
+        listed = firsts(rows, "stamp", f"{camera}/data.csv", notes)
+        files = set(data.glob("[!.]*"))  # any name may be listed, also one that no file can have
         there = {stamp: path for stamp, path in listed.items() if path in files}
+        if not there:
+            raise LogError(f"{data} contains none of the {counted(len(listed), 'image')} that {table} lists")
+        if unlisted := sorted(path.name for path in files - {path for _, path in rows} if path.suffix in SUFFIXES):
+            notes.append(
+                f"{camera}/data.csv lacks {counted(len(unlisted), 'image')} of {camera}/data: {_some(unlisted)}"
+            )
         if missing := [path.name for stamp, path in listed.items() if stamp not in there]:
-            names = f"{missing[0]}{' and others' if len(missing) > 1 else ''}"
-            notes.append(f"{camera}/data.csv lists {counted(len(missing), 'image')} that {camera}/data lacks: {names}")
+            lists = f"{camera}/data.csv lists {counted(len(missing), 'image')}"
+            notes.append(f"{lists} that {camera}/data lacks: {_some(missing)}")
         found.append(there)
     return [ImagePair(*pair) for pair in paired(found, "stamp", folder, notes)]
+
+
+def _some(names: list[str]) -> str:
+    return f"{names[0]}{' and others' if len(names) > 1 else ''}"
 
 
 def _imu(path: Path) -> Iterator[Logged]:
     """Rates, rad/s, and accelerations, m/s^2."""
     samples = [(nanoseconds(row[0], where), where, row[1:7]) for where, row in read_rows(path, 7, ",")]
+    if not samples:
+        raise LogError(f"{path} contains no reading; download it again")
     for stamp, where, row in sorted(samples, key=lambda sample: sample[0]):
         values = numbers_of(row, where)
         yield stamp, "/imu/data_raw", raw_imu(stamp, IMU, values[:3], values[3:])

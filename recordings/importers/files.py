@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.ros2.cdr import LAST_STAMP
 from recordings.ros2.image_from_msg import stated_size, unpacked_pixels
@@ -60,6 +62,16 @@ def read_rows(
         if len(row) < columns:
             raise LogError(f"{where} has only {len(row)} of {columns} columns; correct it or get it again")
         yield where, row
+
+
+def firsts(rows: Iterable[tuple[Any, Any]], what: str, where: str, notes: list[str]) -> dict[Any, Any]:
+    """Key -> value of rows, the first one of each key. A note counts the others. what: the keys in words."""
+    found: dict[Any, Any] = {}
+    repeated = [key for key, value in rows if found.setdefault(key, value) is not value]
+    if repeated:
+        rest = counted(len(repeated), "row")
+        notes.append(f"{where} has {rest} whose {what} is in a row before, first: {repeated[0]}; left out")
+    return found
 
 
 def numbers_of(values: list[str], where: str) -> Array:

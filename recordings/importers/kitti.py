@@ -61,7 +61,7 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
         ImagePair(from_date(line, where), folders[0] / f"{number:010d}.png", folders[1] / f"{number:010d}.png")
         for number, (where, line) in enumerate(read_lines(source / f"image_{left}" / "timestamps.txt", listed=True))
     ]
-    pairs = sorted(existing(listed, "timestamps.txt", notes), key=lambda pair: pair.stamp)
+    pairs = sorted(existing(folders, listed, "timestamps.txt", notes), key=lambda pair: pair.stamp)
     camera_from_imu = _rigid(velo_to_cam, "R", "T") @ _rigid(imu_to_velo, "R", "T")
     size = common_size(pairs)
     rectified = size == tuple(_entry(cameras, f"S_rect_{left}", 2).astype(int))

@@ -23,6 +23,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     common_size,
+    note_frames_without_pose,
     tilts_of,
 )
 from recordings.importers.rig import Rig
@@ -31,6 +32,8 @@ from recordings.ros2.to_msg import imu
 from recordings.source.transforms import orthonormal
 from stages.data import Array, StereoCamera, Transform
 
+MAX_INTERVAL = 60.0  # s; frames that are farther apart have times in another unit
+
 
 def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     """The sequence in a folder with image_0 and so on, calib.txt and times.txt; poses in ../../poses/NN.txt."""
@@ -38,6 +41,8 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     mount, cameras = rig.mount, (2, 3) if color else (0, 1)
     assert mount is not None
     stamps = [from_seconds(line, where, FIRST_STAMP) for where, line in read_lines(source / "times.txt", listed=True)]
+    if len(stamps) > 1 and (interval := float(np.median(np.diff(stamps))) / 1e9) > MAX_INTERVAL:
+        raise LogError(f"{source / 'times.txt'} has frames {interval:g} s apart (median); write times in seconds")
     folders = [source / f"image_{camera}" for camera in cameras]
     listed = [
         ImagePair(stamp, folders[0] / f"{number:06d}.png", folders[1] / f"{number:06d}.png")
@@ -45,7 +50,7 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
     ]
     notes: list[str] = []
     tilts: Iterable[Logged]
-    pairs = existing(listed, "times.txt", notes)
+    pairs = existing(folders, listed, "times.txt", notes)
     if not pairs:
         raise LogError(f"{source} contains no pair of images in image_{cameras[0]} and image_{cameras[1]}")
     projections = [_projections(source / "calib.txt")[camera] for camera in cameras]
@@ -59,13 +64,17 @@ def read_odometry(source: Path, rig: Rig, color: bool) -> ImportedRecording:
         track, tilts = None, ((stamp, "/inclinometer", imu(stamp, BASE, level)) for stamp in stamps)
     else:
         notes.append(f"the tilt is that of the rig file, rotated by the true poses in {poses.name}")
-        track = _track(poses, stamps, mount, shift)
+        track = _track(poses, stamps, mount, shift, notes)
+        note_frames_without_pose(track, pairs, poses.name, notes)
         tilts = tilts_of(track, [pair.stamp for pair in pairs])
     return ImportedRecording.of_rectified(camera, pairs, mount, sensors=[tilts], truth=track, notes=notes)
 
 
-def existing(listed: list[ImagePair], file: str, notes: list[str]) -> list[ImagePair]:
-    """The pairs that have both images. A note counts the others that `file` lists."""
+def existing(folders: list[Path], listed: list[ImagePair], file: str, notes: list[str]) -> list[ImagePair]:
+    """The pairs that have both images. Notes count the others that `file` lists, and the images that it does not."""
+    names = {path.name for folder in folders for path in folder.glob("[!.]*.png")}
+    if unlisted := sorted(names.difference(pair.left.name for pair in listed)):
+        notes.append(f"{file} has no line for {counted(len(unlisted), 'image')}, first: {unlisted[0]}")
     pairs = [pair for pair in listed if pair.left.exists() and pair.right.exists()]
     if len(pairs) < len(listed):
         notes.append(f"{file} lists {counted(len(listed) - len(pairs), 'pair')} without one of the images")
@@ -101,10 +110,14 @@ def _projections(path: Path) -> list[Array]:
     return found
 
 
-def _track(path: Path, stamps: list[int], mount: Transform, shift: Array) -> Track:
+def _track(path: Path, stamps: list[int], mount: Transform, shift: Array, notes: list[str]) -> Track:
     """The poses of the left camera, in a world in which base_link is level in the first frame."""
-    poses = []
-    for (where, line), stamp in zip(read_lines(path, listed=True), stamps, strict=False):
+    poses, lines = [], list(read_lines(path, listed=True))
+    if len(lines) > len(stamps):
+        notes.append(
+            f"{path.name} has {counted(len(lines), 'pose')} for {counted(len(stamps), 'time')}; the last are left out"
+        )
+    for (where, line), stamp in zip(lines, stamps, strict=False):
         row = numbers_of(line.split(), where)
         if row.size != 12:
             raise LogError(f"{where} has {row.size} numbers, not 12; download it again")

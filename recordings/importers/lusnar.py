@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import LogError
 from recordings.importers.files import nanoseconds, numbers_of, read_lines, rotation_of
-from recordings.importers.recording import BASE, ImagePair, ImportedRecording, common_size, paired, tilts_of
+from recordings.importers.recording import (
+    BASE,
+    ImagePair,
+    ImportedRecording,
+    common_size,
+    note_frames_without_pose,
+    paired,
+    tilts_of,
+)
 from recordings.importers.rig import AXES, Rig
 from recordings.importers.track import Track
 
@@ -33,6 +41,7 @@ def read_lusnar(source: Path, rig: Rig) -> ImportedRecording:
     pairs = [ImagePair(nanoseconds(left.stem, str(left)), left, right) for _, left, right in found]
     pairs.sort(key=lambda pair: pair.stamp)
     size, track = common_size(pairs), _track(source / POSES, rig)
+    note_frames_without_pose(track, pairs, POSES, notes)
     camera = rig.camera(size, FOCAL * size[0] / WIDTH, BASELINE)
     tilts = [tilts_of(track, track.stamps.tolist())]
     return ImportedRecording.of_rectified(camera, pairs, rig.mount, sensors=tilts, truth=track, notes=notes)

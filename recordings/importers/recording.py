@@ -248,6 +248,12 @@ def tilts_of(track: Track, stamps: Iterable[int]) -> Iterator[Logged]:
             yield stamp, "/inclinometer", ros2.imu(stamp, track.body, upright(placed.rotation[2]))
 
 
+def note_frames_without_pose(track: Track, pairs: Sequence[ImagePair], file: str, notes: list[str]) -> None:
+    """Add a note about the pairs that have no pose, and so no tilt. file: of the poses."""
+    if without := sum(track.at(pair.stamp) is None for pair in pairs):
+        notes.append(f"{file} has no pose for {counted(without, 'pair')}, without tilt in the log")
+
+
 def fix(stamp: int, frame: str, latitude: float, longitude: float, altitude: float) -> Logged:
     """The place of a frame by GPS, deg and m, of unknown accuracy."""
     status = make("sensor_msgs/msg/NavSatStatus", status=0, service=1)

@@ -24,6 +24,7 @@ from recordings.importers.recording import (
     ImportedRecording,
     Logged,
     common_size,
+    note_frames_without_pose,
     paired,
     tilts_of,
 )
@@ -58,6 +59,7 @@ def read_tartanair(source: Path, rig: Rig) -> ImportedRecording:
         for number, *pair in found
     ]
     track = _track(source / f"pose_{left}.txt")
+    note_frames_without_pose(track, pairs, f"pose_{left}.txt", notes)
     size = common_size(pairs)
     camera = rig.camera(size, size[0] / 2, BASELINE)
     depths = [next(iter(source.glob(f"depth_{left}/{pair.left.stem}_depth.*")), None) for pair in pairs]

@@ -129,10 +129,14 @@ def test_cameras_in_the_wrong_order_are_refused(recording, tmp_path, refused):
     assert "cam1 is the left camera by the calibration; exchange the names of cam0 and cam1" in why
 
 
-def test_a_recording_without_readings_and_whole_images_is_refused(recording, tmp_path, refused):
+def test_a_recording_without_readings_or_whole_images_is_refused(recording, tmp_path, refused):
     folder = shutil.copytree(recording[0], tmp_path / "room") / "mav0"
     shutil.rmtree(folder / "state_groundtruth_estimate0")
+    readings = (folder / "imu0" / "data.csv").read_text()
     (folder / "imu0" / "data.csv").write_text("#timestamp [ns],w_RS_S_x [rad s^-1]\n")
+    assert "imu0/data.csv contains no reading" in refused("import", "euroc", tmp_path / "room", tmp_path / "log.mcap")
+    assert not list(tmp_path.glob("log*"))
+    (folder / "imu0" / "data.csv").write_text(readings)
     for path in (folder / "cam1" / "data").iterdir():
         path.write_bytes(path.read_bytes()[:-100])
     why = refused("import", "euroc", tmp_path / "room", tmp_path / "log.mcap")
@@ -145,6 +149,26 @@ def test_an_image_that_is_none_is_left_out_with_a_note(recording, tmp_path, said
     text = said(0, "import", "euroc", folder, tmp_path / "log.mcap").out
     assert f"1 pair left out, first: {path} is not a readable image" in text
     assert "2 stereo frames" in text
+
+
+def test_repeated_stamps_and_images_that_no_list_has_are_noted(recording, tmp_path, said):
+    mav0 = shutil.copytree(recording[0], tmp_path / "room") / "mav0"
+    table = mav0 / "cam0" / "data.csv"
+    first, second, *_ = [line.split(",") for line in table.read_text().splitlines()[1:]]
+    table.write_text(table.read_text() + f"{first[0]},{second[1]}\n")
+    for name in ("1.png", ".hidden.png"):
+        shutil.copy(mav0 / "cam0" / "data" / first[1], mav0 / "cam0" / "data" / name)
+    text = said(0, "import", "euroc", mav0, tmp_path / "log.mcap").out
+    assert f"cam0/data.csv has 1 row whose stamp is in a row before, first: {first[0]}; left out" in text
+    assert "cam0/data.csv lacks 1 image of cam0/data: 1.png\n" in text
+    np.testing.assert_array_equal(seen_in(tmp_path / "log.mcap")[0].left, SIMULATION.frame(0).images[0])
+
+
+def test_a_camera_without_its_listed_images_is_named(recording, tmp_path, refused):
+    mav0 = shutil.copytree(recording[0], tmp_path / "room") / "mav0"
+    shutil.rmtree(mav0 / "cam1" / "data")
+    why = refused("import", "euroc", mav0, tmp_path / "log.mcap")
+    assert f"{mav0}/cam1/data contains none of the 4 images that {mav0}/cam1/data.csv lists" in why
 
 
 def test_a_real_sequence_has_its_baseline_and_up(tmp_path, said):

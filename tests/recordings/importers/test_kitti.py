@@ -170,6 +170,27 @@ def test_a_pair_with_the_time_of_another_is_left_out_with_a_note(tmp_path, said)
     assert "2 stereo frames" in text
 
 
+def test_images_and_poses_that_do_not_fit_the_times_are_noted(tmp_path, said):
+    folder, rig = write_sequence(gray(EXACT), tmp_path)
+    times, poses = folder / "times.txt", tmp_path / "poses" / "05.txt"
+    lines, rows = times.read_text().splitlines(True), poses.read_text().splitlines(True)
+    given = "import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig
+    times.write_text("".join(lines[:2]))
+    text = said(0, *given).out
+    assert "times.txt has no line for 1 image, first: 000002.png" in text
+    assert "05.txt has 3 poses for 2 times; the last are left out" in text
+    times.write_text("".join(lines))
+    poses.write_text("".join(rows[:2]))
+    assert "05.txt has no pose for 1 pair, without tilt in the log" in said(0, *given).out
+
+
+def test_times_of_a_sequence_in_another_unit_are_refused(tmp_path, refused):
+    folder, rig = write_sequence(gray(EXACT), tmp_path)
+    (folder / "times.txt").write_text("0\n100\n200\n")  # ms
+    why = refused("import", "kitti", folder, tmp_path / "log.mcap", "--rig", rig)
+    assert f"{folder}/times.txt has frames 100 s apart (median); write times in seconds" in why
+
+
 def test_the_poses_of_a_sequence_tilt_its_frames(tmp_path):
     folder, _ = write_sequence(EXACT, tmp_path)
     first = EXACT.base_at(EXACT.stamp(0)).after(EXACT.mounts[0])

@@ -89,6 +89,13 @@ def test_a_number_of_tartanair_beyond_all_times_is_refused(tmp_path, refused):
     )
 
 
+def test_images_of_tartanair_without_a_pose_are_noted(tmp_path, said):
+    folder = write_tartanair(EXACT, tmp_path / "P000")
+    (path := folder / "pose_lcam_front.txt").write_text("".join(path.read_text().splitlines(True)[:2]))
+    text = said(0, "import", "tartanair", folder, tmp_path / "log.mcap").out
+    assert "pose_lcam_front.txt has no pose for 1 pair, without tilt in the log" in text
+
+
 def test_the_camera_of_tartanair_looks_90_degrees_wide(tmp_path, refused):
     folder = write_tartanair(EXACT, tmp_path / "P000")
     assert roverflow("import", "tartanair", folder, tmp_path / "log.mcap") == 0

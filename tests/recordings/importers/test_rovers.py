@@ -145,6 +145,21 @@ def test_a_section_of_devon_is_the_simulators_log(tmp_path, said, refused, sampl
     assert "lacks 'pitch_sign' (1: positive is nose up: 1 or -1); the Devon Island data set does not" in text
 
 
+def test_missing_and_repeated_rows_of_devon_are_noted(tmp_path, said, refused):
+    folder = write_devon(EXACT, tmp_path)
+    times, tilts = tmp_path / "logs" / "image-times.txt", tmp_path / "logs" / "inclinometer-sampled.txt"
+    times.write_text(times.read_text() + "000101 2010-01-01T00:00:00.000-05:00\n")
+    tilts.write_text("".join(tilts.read_text().splitlines(True)[:2]))
+    given = "import", "devon", folder, tmp_path / "log.mcap", "--rig", tmp_path / "rig.yaml"
+    text = said(0, *given).out
+    assert "image-times.txt has 1 row whose number is in a row before, first: 101; left out" in text
+    assert "inclinometer-sampled.txt has no reading for 1 pair" in text
+    _, at, _ = next(iter_decoded(tmp_path / "log.mcap", ["/stereo/left/camera_info"]))
+    assert at == EXACT.stamp(0)
+    tilts.write_text("")
+    assert "inclinometer-sampled.txt contains no reading" in refused(*given)
+
+
 def test_pairs_of_devon_without_times_are_for_import_images(tmp_path, refused):
     why = refused("import", "devon", data_folder("devon"), tmp_path / "log.mcap")
     assert "use import images for pairs without times" in why
