@@ -15,8 +15,23 @@ from stages.data import Array
 MAX_FILE_BYTES = 1_000_000
 
 
+class _RepeatedKey(yaml.MarkedYAMLError):
+    """A mapping has a key twice, of which PyYAML takes the last one."""
+
+
 class _Loader(yaml.SafeLoader):
-    """Plain YAML and OpenCV's matrices."""
+    """Plain YAML without repeated keys, and OpenCV's matrices."""
+
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        known: set[tuple[str, str]] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
+                continue
+            if (key.tag, key.value) in known:
+                raise _RepeatedKey(problem=f"repeats the key '{key.value}'", problem_mark=key.start_mark)
+            known.add((key.tag, key.value))
+        return node
 
 
 def _matrix(loader: _Loader, node: Any) -> Any:
@@ -38,14 +53,13 @@ def read_yaml(path: Path, kind: str = "calibration") -> dict[str, Any]:
     try:
         lines = data.decode("utf-8-sig").splitlines()
         # OpenCV begins its files with %YAML:1.0, which is no YAML directive.
-        content = yaml.load("\n".join(line for line in lines if not line.startswith("%")), _Loader)
+        content = yaml.load("\n".join("" if line.startswith("%") else line for line in lines), _Loader)
         values = _count(content, {})
     except Exception as error:  # foreign text may fail the parser in any way
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark is not None else ""
-        raise LogError(
-            f"the {kind} {path}{where} cannot be read as YAML; correct it, or write it again with its tool"
-        ) from error
+        what = error.problem if isinstance(error, _RepeatedKey) else "cannot be read as YAML"
+        raise LogError(f"the {kind} {path}{where} {what}; correct it, or write it again with its tool") from error
     if values > MAX_FILE_BYTES:
         raise LogError(f"the {kind} {path} expands to more than {MAX_FILE_BYTES} values; write it without aliases")
     if not isinstance(content, dict):

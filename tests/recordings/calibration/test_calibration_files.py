@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings import McapSource
 from recordings.calibration.formats import StereoCalibration, read_calibration
+from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
 from tests.conftest import data_folder
 from tests.recordings.calibration.euroc_bag import euroc_bag, euroc_rosbag2, kalibr_camchain
@@ -264,6 +265,15 @@ def test_a_file_that_is_no_mapping_is_refused(tmp_path, content):
     (tmp_path / "file.yaml").write_text(content)
     with pytest.raises(LogError, match=r"the calibration .*file\.yaml"):
         read_calibration([tmp_path / "file.yaml"])
+
+
+def test_a_repeated_key_is_named_with_its_line(tmp_path):
+    path = tmp_path / "file.yaml"
+    path.write_text("%YAML:1.0\ncam0: &first {rostopic: /a}\ncam1:\n  <<: *first\n  rostopic: /b\n  intrinsics: 1\n")
+    assert read_yaml(path)["cam1"] == {"rostopic": "/b", "intrinsics": 1}
+    path.write_text(path.read_text() + "  rostopic: /c\n")
+    with pytest.raises(LogError, match=r"the calibration .*file\.yaml, line 7 repeats the key 'rostopic'; correct it"):
+        read_yaml(path)
 
 
 @pytest.mark.parametrize("write", [euroc_bag, euroc_rosbag2])
