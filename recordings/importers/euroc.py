@@ -66,7 +66,7 @@ def read_euroc(source: Path, rig: Rig, calibration: Sequence[Path] = ()) -> Impo
     pairs = _pairs(folder, notes)
     truth = next((path for name in TRUTHS if (path := folder / name / "data.csv").exists()), None)
     return ImportedRecording(
-        raw_models(calibrated, common_size(pairs)), False, pairs,
+        raw_models(calibrated, common_size(pairs), calibration), False, pairs,
         mounts, [_imu(folder / "imu0" / "data.csv")],
         None if truth is None else _track(truth), true_tilt=True, notes=notes,
     )  # fmt: skip

@@ -97,9 +97,9 @@ def rotation_of(quaternion: Array, where: str) -> Rotation:
 def nanoseconds(text: str, where: str) -> int:
     """A stamp in whole nanoseconds. Raises LogError, also for one that a spreadsheet rounded (1.40363E+18)."""
     if not text.isdecimal():
-        raise LogError(
-            f"{where} has the stamp '{text}', not whole nanoseconds; spreadsheets round stamps, so download it again"
-        )
+        rounded = re.fullmatch(r"[\d.,]+[eE]\+?\d+", text)
+        remedy = "spreadsheets round stamps, so download it again" if rounded else "write such as 1403636579763555584"
+        raise LogError(f"{where} has the stamp '{text}', not whole nanoseconds since 1970; {remedy}")
     return in_ros_time(int(text[:30]), text, where)
 
 

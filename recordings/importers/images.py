@@ -43,6 +43,7 @@ from recordings.ros2.to_msg import imu, transform_message
 from recordings.source.transforms import rigid
 from stages.data import CameraModel, StereoCamera, StereoFrame, Transform
 
+MAX_HEIGHT = 1e9  # m, as in a rig file
 TILT_OFFSET_NS = 10_000_000  # before and after each pair there is a tilt, so that one is on both sides of it
 _POSITIVE: dict[str, Any] = {"low": 1e-6, "high": 1e9}
 _ANY: dict[str, Any] = {"low": -1e9, "high": 1e9}
@@ -115,8 +116,8 @@ def import_images(
     """
     if len(left) != len(right) or not left:
         raise LogError(f"{len(left)} left and {len(right)} right images are not pairs; give equal numbers")
-    if not 0 < height < math.inf:
-        raise LogError(f"the camera's height must be positive and finite, not {height} m")
+    if not 0 < height <= MAX_HEIGHT:
+        raise LogError(f"the camera's height must be positive and at most {MAX_HEIGHT:g} m, not {height:g} m")
     if not 0 < rate <= 1e9 or FIRST_STAMP + (len(left) + 1) * 1e9 / rate >= LAST_STAMP:
         pairs = counted(len(left), "pair")
         raise LogError(f"the rate of {pairs} must be above 0 and at most 1e9 Hz, not {rate:g}; stamps end in 2038")
@@ -129,35 +130,38 @@ def import_images(
     period = round(1e9 / rate)
     rig = Rig(height=height, pitch_down=math.radians(pitch_down), roll=math.radians(roll))
     files = [calibration] if isinstance(calibration, Path) else calibration
-    own = {known.name for known in fields(ImageCalibration)}
+    own = {known.name for known in fields(ImageCalibration)} - {"width", "height"}  # which other formats also have
     if isinstance(files, Mapping) or (len(files) == 1 and read_yaml(files[0]).keys() & own):
         values = _calibration(files if isinstance(files, Mapping) else files[0])
         camera = read_frame(0, (left[0], right[0]), values).camera
-        rectified, cameras, beside_it = True, rectified_models(camera), beside(camera)
+        first_size, rectified, cameras = not {"width", "height"} <= values.keys(), True, rectified_models(camera)
+        beside_it: Transform | None = beside(camera)
     else:
-        rectified, (cameras, beside_it) = False, _raw(files, (left[0], right[0]))
+        rectified, (cameras, beside_it, first_size) = False, _raw(files, (left[0], right[0]))
     numbered = enumerate(zip(left, right, strict=True))
     paired = [ImagePair(FIRST_STAMP + number * period, *pair) for number, pair in numbered]
     moving, notes = None, list[str]()
     if attitudes is not None:
         paired, moving = read_attitudes(attitudes, paired, rig, notes)
     recording = standing(paired, cameras, beside_it, rig, moving)
-    return write_recording(replace(recording, rectified=rectified, notes=notes), out, progress, report)
+    whole = replace(recording, rectified=rectified, first_size=first_size, notes=notes)
+    return write_recording(whole, out, progress, report)
 
 
 def standing(
     pairs: Sequence[ImagePair],
     cameras: tuple[CameraModel, CameraModel],
-    right: Transform,
+    right: Transform | None,
     rig: Rig,
     moving: Sequence[Transform] | None = None,
 ) -> ImportedRecording:
     """The recording of a rectified pair of cameras on a rover that stands level.
 
-    right: left camera <- right camera; moving: the mount at each pair, else it is that of the rig.
+    right: left camera <- right camera, None if the projections contain it; moving: the mount at each pair, else it is
+    that of the rig.
     """
     stamps = [pair.stamp for pair in pairs]
-    offset = min([TILT_OFFSET_NS, *(np.diff(stamps) // 4).tolist()])
+    offset = min([TILT_OFFSET_NS, stamps[0] // 2, LAST_STAMP - 1 - stamps[-1], *(np.diff(stamps) // 4).tolist()])
     level, sensors = Transform(BASE, IMU, np.eye(3), np.zeros(3)), [_level_tilts(stamps, offset)]
     if moving is None:
         return ImportedRecording(cameras, True, pairs, [rig.mount, right, level], sensors)
@@ -165,15 +169,19 @@ def standing(
     return ImportedRecording(cameras, True, pairs, [right, level], [*sensors, turns])
 
 
-def _raw(files: Sequence[Path], pair: tuple[Path, Path]) -> tuple[tuple[CameraModel, CameraModel], Transform]:
-    """The cameras of images before rectification, and left <- right camera. Raises LogError, also for another pair."""
+def _raw(
+    files: Sequence[Path], pair: tuple[Path, Path]
+) -> tuple[tuple[CameraModel, CameraModel], Transform | None, bool]:
+    """The cameras of images before rectification, left <- right camera, and whether their size is that of the pair.
+
+    The transform is None if the projections contain it. Raises LogError, also for a pair that does not fit.
+    """
     calibrated = read_calibration(files)
-    cameras = raw_models(calibrated, image_size(pair[0]))
-    if calibrated.right_in_left is None:
-        raise LogError(f"{files[0]} lacks the transform between the cameras; give the files of the stereo calibration")
+    cameras = raw_models(calibrated, image_size(pair[0]), files)
     for path, camera in zip(pair, cameras, strict=True):
         image_message(FIRST_STAMP, LEFT, path, camera)
-    return cameras, rigid(LEFT, RIGHT, calibrated.right_in_left)
+    moved = calibrated.right_in_left
+    return cameras, None if moved is None else rigid(LEFT, RIGHT, moved), not calibrated.models[0].width
 
 
 def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
@@ -190,7 +198,8 @@ def _calibration(given: Path | Mapping[str, Any]) -> dict[str, float]:
         ImageCalibration(**loaded)
     except ValueError as error:
         raise LogError(f"{where}: {str(error).removeprefix('ImageCalibration.')}") from error
-    return {"fy": loaded["fx"], "cx_right": loaded["cx"], **loaded}
+    given = {name: value for name, value in loaded.items() if value is not None}
+    return {"fy": given["fx"], "cx_right": given["cx"], **given}
 
 
 def read_frame(stamp: int, pair: tuple[Path, Path], values: dict[str, float]) -> StereoFrame:

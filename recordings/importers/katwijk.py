@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.errors import LogError
-from recordings.importers.files import from_date, numbers_of, read_rows
+from recordings.importers.files import from_date, numbers_of, read_bytes, read_rows
 from recordings.importers.recording import (
     BASE,
     IMU,
@@ -70,7 +70,7 @@ def read_katwijk(source: Path, rig: Rig, calibration: tuple[Path, ...]) -> Impor
     if calibrated.right_in_left is not None:  # else the projections contain the baseline
         mounts.append(rigid(LEFT, RIGHT, calibrated.right_in_left))
     return ImportedRecording(
-        raw_models(calibrated, size), False, pairs, mounts,
+        raw_models(calibrated, size, calibration), False, pairs, mounts,
         [_sensors(source / "imu.txt"), _places(source / "gps-utm31.txt", notes)], notes=notes,
     )  # fmt: skip
 
@@ -89,6 +89,7 @@ def _time(text: str, where: str) -> int:
 
 def _structs(path: Path, size: tuple[int, int]) -> StereoCalibration:
     """The calibration in a MATLAB file of structs (toStruct of stereoParameters)."""
+    read_bytes(path)  # names a file that cannot be read
     try:
         # A damaged file may end the process of scipy's reader, or fill its memory.
         limit = RLIMIT_DATA, (MAX_MAT_BYTES, MAX_MAT_BYTES)

@@ -7,6 +7,7 @@ the same images: it does not read those again that the unfinished log contains.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -61,15 +62,17 @@ class ImportedRecording:
     """What a data set contains.
 
     cameras: left and right; rectified: whether the images are; pairs: in the order of stamps; mounts: static
-    transforms, None for an unknown one; sensors: streams of (stamp, topic, message), each in the order of stamps;
-    truth: the exact poses, written at the frames; true_tilt: whether they are better than the sensors' tilt; more:
-    further messages of a frame; metadata: name and content of a record; notes: what a user should know.
+    transforms, None for an unknown one; first_size: whether the size of the cameras is that of the first image;
+    sensors: streams of (stamp, topic, message), each in the order of stamps; truth: the exact poses, written at the
+    frames; true_tilt: whether they are better than the sensors' tilt; more: further messages of a frame; metadata: name
+    and content of a record; notes: what a user should know.
     """
 
     cameras: tuple[CameraModel, CameraModel]
     rectified: bool
     pairs: Sequence[ImagePair]
     mounts: Sequence[Transform | None]
+    first_size: bool = field(default=False, kw_only=True)
     sensors: Sequence[Iterable[Logged]] = ()
     truth: Track | None = None
     true_tilt: bool = False
@@ -82,7 +85,9 @@ class ImportedRecording:
         cls, camera: StereoCamera, pairs: Sequence[ImagePair], mount: Transform | None, *others: Transform, **rest: Any
     ) -> ImportedRecording:
         """The recording of rectified pairs. mount: base_link <- left camera; others: of sensors; rest: as above."""
-        return cls(rectified_models(camera), True, pairs, [mount, beside(camera), *others], **rest)
+        return cls(
+            rectified_models(camera), True, pairs, [mount, beside(camera), *others], first_size=True, **rest
+        )  # fmt: skip
 
 
 def write_recording(
@@ -104,7 +109,7 @@ def write_recording(
     cameras = calibrated_pair(recording.cameras, (LEFT, RIGHT), (topics[0], topics[1]), tree)
     if not recording.pairs:
         raise LogError("no pair of images was found; check the folder")
-    unreadable: list[str] = []
+    unreadable: list[LogError] = []
 
     with ResumableWriter(out, _mark(recording)) as writer:
         if writer.contained:
@@ -125,6 +130,7 @@ def write_recording(
             writer.metadata(*recording.metadata)
         if len(unreadable) == len(recording.pairs):
             raise LogError(f"none of {counted(len(unreadable), 'pair')} can be used, first: {unreadable[0]}")
+        _check_first_size(recording, unreadable)
     left_out = f"{counted(len(unreadable), 'pair')} left out, first: {unreadable[0]}" if unreadable else ""
     return len(recording.pairs) - len(unreadable), [*recording.notes, *filter(None, [left_out])]
 
@@ -135,7 +141,7 @@ def _frames(
     tree: TransformTree,
     topics: Sequence[str],
     writer: ResumableWriter,
-    unreadable: list[str],
+    unreadable: list[LogError],
     progress: Callable[[int], None],
 ) -> Iterator[Logged]:
     """The messages of each frame; those of images that the unfinished log contains are `Deferred`.
@@ -148,9 +154,9 @@ def _frames(
         try:
             if stamp == before:
                 raise LogError(f"{pair.left} has the same time as the image before it, {stamp} ns")
-            images = _images(pair, recording.cameras, topics, writer.contained)
+            images = _images(pair, recording, topics, writer.contained)
         except LogError as error:
-            unreadable.append(str(error))
+            unreadable.append(error)
             continue
         before = stamp
         for side, frame, model in zip(SIDES, (LEFT, RIGHT), recording.cameras, strict=True):
@@ -162,11 +168,11 @@ def _frames(
 
 
 def _images(
-    pair: ImagePair, cameras: Sequence[CameraModel], topics: Sequence[str], contained: Mapping[str, Collection[int]]
+    pair: ImagePair, recording: ImportedRecording, topics: Sequence[str], contained: Mapping[str, Collection[int]]
 ) -> list[Logged]:
     """The messages of a pair, `Deferred` if an unfinished log contains both. Raises LogError."""
-    sides = zip((LEFT, RIGHT), (pair.left, pair.right), cameras, strict=True)
-    makers = [partial(image_message, pair.stamp, *side) for side in sides]
+    sides = zip((LEFT, RIGHT), (pair.left, pair.right), recording.cameras, strict=True)
+    makers = [partial(image_message, pair.stamp, *side, recording.first_size) for side in sides]
     possible = [topic + ending for topic in topics for ending in ENDINGS]
     named = [topic for topic in possible if pair.stamp in contained.get(topic, ())]
     if len(named) == len(makers):
@@ -176,10 +182,35 @@ def _images(
     return [(pair.stamp, topic, message) for topic, message in zip(named, messages, strict=True)]
 
 
-def image_message(stamp: int, frame: str, path: Path, model: CameraModel) -> Any:
-    """The message of an image file. Raises LogError if it is truncated or does not fit the calibration."""
+class _OtherSizeError(LogError):
+    """An image has another size, px, than the calibration."""
+
+    def __init__(self, sentence: str, size: tuple[int, int]) -> None:
+        super().__init__(sentence)
+        self.size = size
+
+
+def _check_first_size(recording: ImportedRecording, unreadable: Sequence[LogError]) -> None:
+    """Raise LogError if the size of the cameras is that of the first image, and more pairs have another one."""
+    sizes = Counter(error.size for error in unreadable if isinstance(error, _OtherSizeError))
+    if not recording.first_size or not sizes:
+        return
+    (size, count), model = sizes.most_common(1)[0], recording.cameras[0]
+    if count > len(recording.pairs) - len(unreadable):
+        raise LogError(
+            f"the first image is {model.width}x{model.height}, but more pairs are {size[0]}x{size[1]}; give a folder "
+            "with images of one size"
+        )
+
+
+def image_message(stamp: int, frame: str, path: Path, model: CameraModel, first_size: bool = False) -> Any:
+    """The message of an image file. Raises LogError if it is truncated or does not fit the calibration.
+
+    first_size: whether the size of the calibration is that of the first image.
+    """
     if (size := image_size(path)) != (model.width, model.height):
-        raise LogError(f"{path} is {size[0]}x{size[1]}, but the calibration is for {model.width}x{model.height}")
+        other = f"the {'first image is' if first_size else 'calibration is for'} {model.width}x{model.height}"
+        raise _OtherSizeError(f"{path} is {size[0]}x{size[1]}, but {other}", size)
     content = read_bytes(path)
     if encoding := encoding_of(content):
         if is_cut(content):
@@ -269,8 +300,20 @@ def rectified_models(camera: StereoCamera) -> tuple[CameraModel, CameraModel]:
     return pinhole(camera, "left"), pinhole(camera, "right")
 
 
-def raw_models(calibration: StereoCalibration, size: tuple[int, int]) -> tuple[CameraModel, CameraModel]:
-    """The calibration of a pair before rectification, with K as the projection and `size`, px, where it has none."""
+def raw_models(
+    calibration: StereoCalibration, size: tuple[int, int], files: Sequence[Path]
+) -> tuple[CameraModel, CameraModel]:
+    """The calibration of a pair before rectification, with K as the projection and `size`, px, where it has none.
+
+    files: of the calibration. Raises LogError if the left camera is not the first one, or the baseline is unknown.
+    """
+    shown, baseline = " and ".join(map(str, files)), calibration.baseline
+    if not baseline and calibration.right_in_left is None:
+        raise LogError(f"{shown} lacks the baseline of the cameras; give the files of the stereo calibration")
+    if baseline < 0:
+        raise LogError(
+            f"the first camera of {shown} is the right one (baseline {baseline:.4g} m); give the left one first"
+        )
     models = []
     for model in calibration.models:
         p = model.p if np.any(model.p) else np.column_stack([model.k, np.zeros(3)])

@@ -38,7 +38,7 @@ class Rig(Checked):
     yaw: float = parameter(0.0, "heading of the camera to the left of base_link's x axis", **_TURN)
     forward: float = parameter(0.0, "place of the left camera ahead of base_link", **_PLACE)
     left: float = parameter(0.0, "place of the left camera to the left of base_link", **_PLACE)
-    fx: float | None = parameter(None, "focal length", **_LENS)
+    fx: float | None = parameter(None, "focal length", unit="px", low=1.0, high=1e6)
     cx: float | None = parameter(None, "principal point", **_LENS)
     cy: float | None = parameter(None, "principal point", **_LENS)
     baseline: float | None = parameter(None, "distance of the cameras", unit="m", low=0.001, high=10.0)

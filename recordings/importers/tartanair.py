@@ -94,7 +94,10 @@ def _depth(path: Path) -> Array:
     """(H, W) float32, m, of a depth image or, in TartanAir's first version, of a numpy file."""
     try:
         if path.suffix == ".npy":
-            return np.asarray(np.load(path, allow_pickle=False), np.float32)
+            depth = np.asarray(np.load(path, allow_pickle=False), np.float32)
+            if depth.ndim != 2:
+                raise ValueError(f"{depth.ndim} dimensions")
+            return depth
         content = cv2.imdecode(np.frombuffer(read_bytes(path), np.uint8), cv2.IMREAD_UNCHANGED)
         return np.ascontiguousarray(content).view("<f4")[:, :, 0]
     except (ValueError, IndexError, TypeError, EOFError, OSError, SyntaxError, TokenError, cv2.error) as error:

@@ -1,7 +1,9 @@
 """Damaged files of data sets that were once a traceback, the end of the process, or a wrong rotation."""
 
 import re
+from io import BytesIO
 
+import numpy as np
 import pytest
 
 from tests.fuzz.folders import LAYOUTS
@@ -10,6 +12,12 @@ from tests.fuzz.folders import LAYOUTS
 def turned(content: bytes) -> bytes:
     """A transform whose rotation mirrors."""
     return content.replace(b"R: ", b"R: -")
+
+
+def two_channels(content: bytes) -> bytes:
+    """An array of numpy with a last dimension of 2."""
+    np.save(file := BytesIO(), np.stack([np.load(BytesIO(content))] * 2, axis=-1))
+    return file.getvalue()
 
 
 CASES = {
@@ -45,6 +53,9 @@ CASES = {
     "stamps that a spreadsheet rounded": (
         "euroc", "room/mav0/imu0/data.csv", lambda content: content.replace(b"1700086", b"1.7E+18"),
         "spreadsheets round stamps"),
+    "a header of stamps": (
+        "euroc", "room/mav0/cam0/data.csv", lambda content: content.replace(b"#", b"", 1),
+        "the stamp 'timestamp [ns]', not whole nanoseconds since 1970; write such as 1403636579763555584"),
     "semicolons between columns": (
         "euroc", "room/mav0/cam0/data.csv", lambda content: content.replace(b",", b";"), "has only 1 of 2 columns"),
     "another lens": (
@@ -54,6 +65,12 @@ CASES = {
     "no calibration": ("euroc", "room/mav0/cam0/sensor.yaml", lambda content: None, "give --calibration"),
     "MATLAB's file cut off": (
         "katwijk", "P1/LocCam_calibstruct.mat", lambda content: content[:700], "no struct 'stereoParams'"),
+    "no MATLAB's file": (
+        "katwijk", "P1/LocCam_calibstruct.mat", lambda content: None, "LocCam_calibstruct.mat: No such file"),
+    "a lens without a focal length": (
+        "tartanair", "P0/rig.yaml", lambda content: re.sub(rb"fx: .*", b"fx: 0", content), "'fx': must be at least 1"),
+    "depth of two channels": (
+        "tartanair", "P0/depth_left/000000_left_depth.npy", two_channels, "not a depth image"),
     "numpy's header without an end": (
         "tartanair", "P0/depth_left/000000_left_depth.npy", lambda content: content.replace(b"'shape'", b"(((((((", 1),
         "not a depth image"),

@@ -167,7 +167,7 @@ def test_a_wrong_calibration_is_refused_and_leaves_no_file(tmp_path, change, sen
 @pytest.mark.parametrize(("option", "values", "sentence"), [
     ("pitch_down", (91, np.nan), "are impossible"),
     ("roll", (181,), "are impossible"),
-    ("height", (0.0, np.inf, np.nan), "height .*must be"),
+    ("height", (0.0, 1e10, np.inf, np.nan), "height .*must be"),
     ("rate", (0.0, np.inf, np.nan, 1e-12, 1e10), "rate .*must be"),
 ])  # fmt: skip
 def test_an_impossible_attitude_height_or_rate_is_refused(tmp_path, option, values, sentence):
@@ -185,6 +185,8 @@ def test_the_calibration_may_be_a_file(tmp_path):
     imported(tmp_path, pairs, file)
     camera = frame_of(tmp_path / "out.mcap").camera
     assert (camera.fy, camera.cx, camera.cx_right) == (21.5, 11.0, 13.0)
+    file.write_text("fx: 20\nfy:\ncx: 11\ncy: 7\nwidth:\nheight: null\nbaseline: 0.25\n")  # as if not given
+    assert imported(tmp_path, pairs, file) == (1, [])
     file.write_text("fx: [")
     with pytest.raises(LogError, match="cannot be read as YAML"):
         imported(tmp_path, pairs, file)
@@ -220,6 +222,31 @@ def row_offset(frame):
     return np.median(likely[:, 1])
 
 
+def camera_info(shift: float) -> dict[str, Any]:
+    """A camera_info file; shift: P[0, 3]."""
+    k, d = np.array([[20.0, 0, 11.5], [0, 20.0, 7.5], [0, 0, 1.0]]), [0.01, 0.0, 0.0, 0.0, 0.0]
+    matrices = {"camera_matrix": k, "distortion_coefficients": d, "rectification_matrix": np.eye(3),
+                "projection_matrix": np.column_stack([k, [shift, 0, 0]])}  # fmt: skip
+    data = {name: {"data": np.ravel(matrix).tolist()} for name, matrix in matrices.items()}
+    return {"image_width": 24, "image_height": 16, "distortion_model": "plumb_bob", **data}
+
+
+def test_camera_info_files_of_ros_have_the_baseline_of_their_projections(tmp_path):
+    pairs, files = make_pairs(tmp_path, 1), [tmp_path / f"{side}.yaml" for side in SIDES]
+    for path, shift in zip(files, (0.0, -5.0), strict=True):
+        path.write_text(yaml.safe_dump(camera_info(shift)))
+    assert imported(tmp_path, pairs, files) == (1, [])
+    camera = frame_of(tmp_path / "out.mcap").camera
+    assert (camera.baseline, camera.raw[0].d[0]) == (0.25, 0.01)
+    swapped = (
+        r"the first camera of .*right\.yaml and .*left\.yaml is the right one .*-0\.25 m.*; give the left one first"
+    )
+    with pytest.raises(LogError, match=swapped):
+        imported(tmp_path, pairs, files[::-1])
+    with pytest.raises(LogError, match=r"left\.yaml lacks the baseline of the cameras"):
+        imported(tmp_path, pairs, [files[0], files[0]])
+
+
 def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tmp_path):
     _, right = pairs = make_pairs(tmp_path, 1)
     lens = {"D1": [[0.01, 0, 0, 0]], "D2": [[0.02, 0, 0, 0]], "R": np.eye(3).tolist(), "T": [-0.25, 0, 0]}
@@ -229,6 +256,8 @@ def test_a_calibration_before_rectification_needs_both_cameras_and_their_size(tm
     camera = frame_of(tmp_path / "out.mcap").camera
     assert camera.baseline == pytest.approx(0.25)
     assert [model.d[0] for model in camera.raw] == [0.01, 0.02]
+    file.write_text(yaml.safe_dump({**lens, "width": 24, "height": 16}))
+    assert imported(tmp_path, pairs, file) == (1, [])
     save(right[0], picture(0)[:8])
     with pytest.raises(LogError, match="is 24x8, but the calibration is for 24x16"):
         imported(tmp_path, pairs, file)
@@ -270,6 +299,22 @@ def test_a_later_pair_that_is_cut_or_of_another_size_is_left_out(tmp_path, said)
     assert f"2 pairs left out, first: {right[1]} is truncated after" in text
     assert "2 stereo frames" in text
     assert np.diff(stamps_in(events(tmp_path / "out.mcap"))).tolist() == [3_000_000_000]
+
+
+def test_a_first_image_of_a_rarer_size_is_refused(tmp_path):
+    left, right = make_pairs(tmp_path, 4)
+    for path in (left[0], right[0]):
+        save(path, picture(0)[:8])
+    with pytest.raises(LogError, match="the first image is 24x8, but more pairs are 24x16; give a folder"):
+        imported(tmp_path, (left, right))
+    _, (note,) = imported(tmp_path, (left[:2], right[:2]))
+    assert note == f"1 pair left out, first: {left[1]} is 24x16, but the first image is 24x8"
+
+
+def test_stamps_of_attitudes_near_zero_have_tilts_beside_them(tmp_path):
+    (attitudes := tmp_path / "a.csv").write_text("name,stamp,pitch_down\n0-left,5,14\n1-left,500000000,14\n")
+    assert imported(tmp_path, make_pairs(tmp_path, 2), attitudes=attitudes) == (2, [])
+    assert [frame.stamp for frame in seen_in(tmp_path / "out.mcap")] == [5, 500_000_000]
 
 
 def test_each_pair_has_the_attitude_of_a_csv_file(tmp_path):
