@@ -146,6 +146,8 @@ def encoding_of(content: bytes) -> str:
 
 def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file, px. Raises LogError."""
+    if path.is_fifo():  # which would be waited for
+        raise LogError(f"{path} is a pipe, not an image")
     if size := stated_size(read_bytes(path)):
         return size
     height, width = read_pixels(path).shape[:2]

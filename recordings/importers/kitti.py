@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.importers.files import from_date, numbers_of, read_lines
 from recordings.importers.kitti_odometry import existing, read_odometry, stereo_camera
@@ -72,7 +73,7 @@ def read_kitti(source: Path, rig: Rig, color: bool = False) -> ImportedRecording
     if base is None:
         base = Transform(BASE, IMU, np.eye(3), np.array([0.0, 0.0, IMU_HEIGHT])).after(to_imu.inverse())
         notes.append(f"base_link is {IMU_HEIGHT} m below the Imu, as on KITTI's car; the rig file can change this")
-    stamps, table = _readings(source / "oxts")
+    stamps, table = _readings(source / "oxts", notes)
     track = _track(stamps, table, source / "oxts")
     mounts, sensors = [base, right_in_left, to_imu], [_tilts(track), _fixes(stamps, table)]
     return ImportedRecording(models, rectified, pairs, mounts, sensors, track, notes=notes)
@@ -123,10 +124,11 @@ def _raw(values: dict[str, Array], left: str, right: str) -> tuple[Any, Transfor
     return tuple(models), rigid(LEFT, RIGHT, first @ np.linalg.inv(second)), first
 
 
-def _readings(oxts: Path) -> tuple[list[int], Array]:
+def _readings(oxts: Path, notes: list[str]) -> tuple[list[int], Array]:
     """Stamps, and (n, 6) latitude and longitude, deg, altitude, m, roll, pitch and yaw, rad, of the INS."""
     rows, stamps = [], []
-    for number, (where, line) in enumerate(read_lines(oxts / "timestamps.txt", listed=True)):
+    lines = list(read_lines(oxts / "timestamps.txt", listed=True))
+    for number, (where, line) in enumerate(lines):
         if (path := oxts / "data" / f"{number:010d}.txt").exists():
             stamps.append(from_date(line, where))
             rows.append(next((numbers_of(text.split()[:6], place) for place, text in read_lines(path)), np.zeros(0)))
@@ -134,6 +136,8 @@ def _readings(oxts: Path) -> tuple[list[int], Array]:
                 raise LogError(f"{path} has fewer than 6 numbers; download it again")
     if not rows:
         raise LogError(f"{oxts} contains no readings of the Imu; download the oxts folder of the drive")
+    if len(rows) < len(lines):
+        notes.append(f"oxts/timestamps.txt lists {counted(len(lines) - len(rows), 'reading')} without a file")
     return stamps, np.array(rows)
 
 

@@ -115,7 +115,9 @@ def test_a_drive_is_the_simulators_log(tmp_path, said, refused, cameras):
     _, _, place = next(iter_decoded(log, ["/gps/fix"]))
     assert place.latitude == pytest.approx(49, abs=1e-9)
     assert place.header.frame_id == "imu_link"
-    (folder / "oxts" / "data" / "0000000001.txt").write_text("49 8 \n")
+    (reading := folder / "oxts" / "data" / "0000000001.txt").unlink()
+    assert "oxts/timestamps.txt lists 1 reading without a file" in said(0, "import", "kitti", folder, log, *option).out
+    reading.write_text("49 8 \n")
     assert "fewer than 6 numbers" in refused("import", "kitti", folder, log, *option)
     (tmp_path / CALIBRATIONS[0]).write_text("")
     assert f"lacks 'S_rect_{cameras[0]}' with 2 numbers" in refused("import", "kitti", folder, log, *option)

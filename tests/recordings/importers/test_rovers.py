@@ -1,5 +1,6 @@
 """Traverses of rovers become logs: Katwijk beach and Devon Island."""
 
+import os
 from dataclasses import replace
 from datetime import UTC, datetime
 
@@ -110,6 +111,17 @@ def test_a_part_of_katwijk_is_the_simulators_log(tmp_path, said, refused, outwar
     assert {item.latitude for _, _, item in iter_decoded(log, ["/gps/fix"])} == {52.2}
     assert "with 'height'" in refused("import", "katwijk", folder, log, *given[:2])
     assert roverflow("import", "katwijk", folder, log, "--calibration", folder / "rig.yaml", *given[2:]) == 2
+
+
+def test_a_pipe_in_place_of_an_image_is_left_out(tmp_path, said):
+    folder = write_katwijk(BEACH, tmp_path / "Part1")
+    (path := sorted((folder / "LocCam").glob("*_1.png"))[1]).unlink()
+    os.mkfifo(path)
+    (folder / "LocCam" / f"._{path.name}").write_bytes(b"of macOS")
+    given = "--calibration", folder / "LocCam_calibstruct.mat", "--rig", folder / "rig.yaml"
+    text = said(0, "import", "katwijk", folder, tmp_path / "log.mcap", *given).out
+    assert f"1 pair left out, first: {path} is a pipe, not an image" in text
+    assert "1 image without a partner" in text
 
 
 def test_a_part_of_katwijk_takes_a_calibration_of_opencv(tmp_path):
