@@ -18,9 +18,9 @@ from flow.errors import UsageError
 from recordings import McapSource
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
-from recordings.ros2.from_msg import read_disparity, read_grid_map, read_occupancy_grid
+from recordings.ros2.from_msg import level_in, read_disparity, read_grid_map, read_occupancy_grid, read_point_cloud
 from stages import FuseRegion, Rectify, VisualOdometry
-from stages.data import Cell
+from stages.data import Cell, PixelOrigin
 from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, halves, rewrite, roverflow, run_fast, slow
 
 AT = 1.0
@@ -248,10 +248,23 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, sai
     assert all(abs(frame.height - found.layers["elevation"]) < 0.05 for frame in found.frames)
     assert output.count(" points, height ") == FRAMES
     assert why_regional(fast_result, np.datetime64(end, "ns"), (x, y)).frames == found.frames  # without input
-    assert f"frames with points in the cell (of the clouds that the log keeps, thinned to 2 cm): {FRAMES}\n" in output
+    kept = "of the clouds that the log keeps, thinned to 2 cm"
+    assert f"frames with measured points in the cell ({kept}): {FRAMES}\n" in output
     assert len(why_regional(fast_result, 0, (x, y), log=traverse).frames) == 1
     for cell, why_not in (("--pixel=9,9", "is a regional map: give --cell"), ("--cell=999,1", "map in 'odom'")):
         assert why_not in refused("why", fast_result, *late[:2], cell, *late[3:])
+
+
+def test_guessed_and_distant_points_are_no_part_of_a_regional_cell(traverse, tmp_path):
+    out = run_fast(tmp_path / "out.mcap", traverse, "--end", 0.8, "--set", "regional_cells.max_range=4 m")
+    ((_, stamp, cloud), (_, _, transforms)) = iter_decoded(out, ["/nav/points", "/tf"])
+    fields, level = read_point_cloud(cloud), level_in([transforms], "odom")
+    cells = np.floor(level(np.column_stack([fields[axis] for axis in "xyz"]))[:, :2] / 0.05)
+    guessed, distant = fields["source"] != PixelOrigin.MEASURED, np.hypot(fields["x"], fields["y"]) > 4.1
+    for others in (guessed, distant):
+        alone = set(map(tuple, cells[others].tolist())) - set(map(tuple, cells[~others].tolist()))
+        x, y = 0.05 * (np.array(min(alone, key=lambda cell: np.hypot(*cell))) + 0.5)
+        assert why_regional(out, np.datetime64(stamp, "ns"), (x, y)).frames == []
 
 
 @pytest.mark.parametrize("stream", ["pose", "health/frames"])

@@ -5,6 +5,7 @@ Everything is in the result log, so nothing runs again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -17,17 +18,18 @@ from flow.cli.debugging.explanation import CellExplanation, centre_of, index_of,
 from flow.cli.debugging.instants import Instant, ns_of
 from flow.cli.debugging.result_input import graph_of, input_of
 from flow.errors import UsageError
+from flow.runtime.graph import Graph
 from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
 from recordings.results import read_result
 from recordings.ros2.from_msg import level_in, read_point_cloud
 from recordings.scoring.result_log import stamps_of
-from stages import Binarise
-from stages.data import Array, ElevationMap, NavigationMap, Transform
+from stages import Binarise, FuseRegion
+from stages.data import Array, ElevationMap, NavigationMap, PixelOrigin, Transform
 
 
 class Contribution(NamedTuple):
-    """Points of one frame in a cell: its stamp, ns, their number and their mean height, m."""
+    """Measured points of one frame in a cell: its stamp, ns, their number and their mean height, m."""
 
     stamp: int
     points: int
@@ -43,7 +45,8 @@ class RegionalExplanation(CellExplanation):
     frame_id : str
         The map's frame.
     frames : list of Contribution
-        The frames with points in the cell, up to the map's stamp; the points are those that the log keeps.
+        The frames of the map with measured points in the cell, within the range that a frame adds to the map. The
+        points are those that the log keeps.
     spacing : float
         To which the log's points are thinned, m; 0: they are not.
     """
@@ -112,7 +115,7 @@ def why_regional(
         stream=stream,
         notes=notes,
         frame_id=navigation.frame_id,
-        frames=_contributions(result, navigation, centre_of(navigation, place)),
+        frames=_contributions(result, terrain, centre_of(navigation, place), _max_range(graph, stream)),
         spacing=next((getattr(sink, "point_spacing", 0.0) for _, sink in graph.sinks if sink.suffix == ".mcap"), 0.0),
     )
 
@@ -133,24 +136,38 @@ def _maps(result: Path, at: int, stream: str, elevation: str) -> tuple[Navigatio
     return found
 
 
-def _contributions(result: Path, navigation: NavigationMap, centre: tuple[float, float]) -> list[Contribution]:
-    """The points of each frame up to the map's stamp that lie in a cell."""
-    found = []
-    for stamp, group in groupby(iter_decoded(result, ["/nav/points", "/tf"]), key=lambda item: item[1]):
-        if stamp > navigation.stamp:
-            break
+def _max_range(graph: Graph, stream: str) -> float:
+    """The horizontal range, m, that a frame adds to a regional map; inf if no `FuseRegion` makes it."""
+    actors = [node.actor for node in graph.upstream_of([stream]).nodes]
+    return next((actor.max_range for actor in actors if isinstance(actor, FuseRegion)), math.inf)
+
+
+def _contributions(
+    result: Path, terrain: ElevationMap, centre: tuple[float, float], max_range: float
+) -> list[Contribution]:
+    """The points of each frame of a map that lie in a cell. max_range: m, that a frame adds to the map."""
+    found, part = list[Contribution](), (terrain.epoch, terrain.stamp + 1)
+    decoded = iter_decoded(result, ["/nav/points", "/tf"], part=part)
+    for stamp, group in groupby(decoded, key=lambda item: item[1]):
         of_stamp = [(topic, message) for topic, _, message in group]
-        messages, level = dict(of_stamp), level_in((message for _, message in of_stamp), navigation.frame_id)
+        messages, level = dict(of_stamp), level_in((message for _, message in of_stamp), terrain.frame_id)
         if level is None or "/nav/points" not in messages:
             continue
-        heights = _heights(read_point_cloud(messages["/nav/points"]), level, centre, navigation.resolution)
+        fields = read_point_cloud(messages["/nav/points"])
+        heights = _heights(fields, level, centre, terrain.resolution, max_range)
         if heights.size:
             found.append(Contribution(stamp, len(heights), float(heights.mean())))
     return found
 
 
-def _heights(fields: Mapping[str, Array], level: Transform, centre: tuple[float, float], resolution: float) -> Array:
-    """The heights, m, of those points (in frame `level`) that lie in a cell of the map."""
+def _heights(
+    fields: Mapping[str, Array], level: Transform, centre: tuple[float, float], resolution: float, max_range: float
+) -> Array:
+    """The heights, m, of those points (in frame `level`) that the map takes into a cell, as `frame_grid` does."""
     points = level(np.column_stack([fields[axis] for axis in "xyz"]).astype(np.float64))
-    inside = np.all(np.abs(points[:, :2] - centre) <= resolution / 2, axis=1)
-    return np.asarray(points[inside, 2])
+    corner = np.floor(level.translation[:2] / resolution) * resolution  # of the rover's cell
+    taken = np.all(np.abs(points[:, :2] - centre) <= resolution / 2, axis=1)
+    taken &= np.linalg.norm(points[:, :2] - corner, axis=1) <= max_range
+    if "source" in fields:
+        taken &= fields["source"] == PixelOrigin.MEASURED
+    return np.asarray(points[taken, 2])

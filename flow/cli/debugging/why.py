@@ -89,7 +89,7 @@ def _regional(options: argparse.Namespace) -> int:
     more = f"; {conflicts:.0f} contradicted the height" if conflicts > 0 else ""
     thinned = f", thinned to {100 * found.spacing:g} cm" if found.spacing else ""
     kept = f"of the clouds that the log keeps{thinned}"
-    lines.append(f"frames with points in the cell ({kept}): {len(found.frames)}{more}")
+    lines.append(f"frames with measured points in the cell ({kept}): {len(found.frames)}{more}")
     lines += [
         f"  {moment(frame.stamp)}  {counted(frame.points, 'point'):>11}, height {frame.height:.3f} m"
         for frame in found.frames
