@@ -2,6 +2,7 @@
 
 import socket
 import time
+from itertools import product
 from operator import itemgetter
 
 import numpy as np
@@ -49,8 +50,10 @@ def test_the_frame_of_a_stamp_is_read_however_late_the_log_has_it(traverse, stam
     begin = next(log_time for topic, _, _, log_time, _ in rows if "stereo" in topic) if joined else 0
     log = write_mcap(tmp_path / "late.mcap", [row for row in rows if row[3] >= begin or "static" in row[0]])
     with McapSource().open(log) as opened:
-        for number, stamp in enumerate(stamps):
-            part = part_of(opened, np.datetime64(stamp, "ns"), 1, min(number, 1))
+        for (number, stamp), as_seconds in product(enumerate(stamps), (False, True)):
+            seconds = (stamp - opened.begin) / 1e9
+            part = part_of(opened, seconds if as_seconds else np.datetime64(stamp, "ns"), 1, min(number, 1))
+            assert part.at == pytest.approx(seconds, abs=1e-9)
             opened.narrow(part.start, part.end)
             assert stamps_in(opened.events(("left",))) == stamps[max(number - 1, 0) : number + 1]
 
@@ -81,6 +84,8 @@ def test_a_time_outside_the_images_is_refused_unless_it_is_a_rounded_one(travers
         for outside in (0.1, 2.0, day + np.timedelta64(400, "ms")):
             with pytest.raises(UsageError, match=r"is outside the images of the log, which lie from .* to [^ ]* "):
                 part_of(log, outside, 1, 0)
+        with pytest.raises(UsageError, match=r"lie from 0\.513 to 1\.513 s$"):
+            part_of(log, 2.0, 1, 0)
 
 
 def free_port():

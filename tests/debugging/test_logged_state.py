@@ -81,7 +81,7 @@ def test_the_state_is_reported(run, tmp_path, said):
     log, result = run
     change = ("--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
     output = said(0, "try", log, "--at", AT, "--result", result, *change).out
-    assert "1 frame from 1.534 s on, after 1 frame before it" in output
+    assert "1 frame from 1.513 s on, after 1 frame before it" in output
     streams = "regional_cells" if log.name == "traverse.mcap" else "motion, pose, regional_cells"
     assert f"state of {streams}, regional_cells@B from {result} at 22:13:20.513 (1700086400513000000 ns)" in output
     assert "the log rounds its heights to 1 mm and its variances to 1 %" in output

@@ -106,7 +106,7 @@ def test_a_variant_whose_stage_fails_says_why_and_the_others_are_scored(traverse
 def test_frames_before_the_instant_give_the_stages_with_memory_their_state(traverse, tmp_path, said):
     change = ("-p", "fast", "--set", "regional_cells.max_range=4 m", "-o", tmp_path / "try.rrd")
     output = said(0, "try", traverse, "--at", "1.05", "--before", FRAMES, *change).out
-    assert "1 frame from 1.034 s on, after 1 frame before it" in output
+    assert "1 frame from 1.013 s on, after 1 frame before it" in output
     assert "/nav/regional_map: 1 of 1 messages differ" in output
 
 
@@ -126,7 +126,7 @@ def test_frames_before_the_instant_are_neither_compared_nor_scored(traverse, tmp
 def test_the_frames_that_were_compared_are_counted(traverse, tmp_path, said):
     words = ("--at", "1.05", "--frames", 99, "-p", "fast", *SMALL, "-o", tmp_path / "b.rrd")
     output = said(0, "try", traverse, *words).out
-    assert "2 frames from 1.034 s on: " in output
+    assert "2 frames from 1.013 s on: " in output
     assert "\nnote: the log has only 2 frames from there on, not 99\n" in output
 
 
@@ -134,10 +134,10 @@ def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_p
     log = rewrite(traverse, tmp_path / "a.mcap", lambda *one: None if one[0] == RIGHT and one[1] == 1 else one[2])
     words = ("-p", "fast", *SMALL, "-o", tmp_path / "b.rrd")
     output = said(0, "try", log, "--at", "0.5", "--frames", 3, *words).out
-    assert "2 frames from 0.534 s on: " in output
+    assert "2 frames from 0.513 s on: " in output
     assert "\nnote: 1 frame gave no result; roverflow run --start " in output
     why = refused("try", log, "--at", "1.05", *words)
-    assert "no frame was completed at 1.034 s: left unmatched; roverflow run --start " in why
+    assert "no frame was completed at 1.013 s: left unmatched; roverflow run --start " in why
 
 
 def test_a_comparison_ends_before_the_disk_is_full(traverse, tmp_path, said, monkeypatch):

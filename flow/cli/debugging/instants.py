@@ -29,7 +29,7 @@ class Part:
     """The frames of an instant, and those before it. Times are in s after the log's first message.
 
     start, end: the part to read; first: where it would begin without the frames before the instant; at, stamp: the
-    first frame of the instant, in s and as its stamp, ns; frames, before: numbers of left images from the instant on
+    stamp of the first frame of the instant, in s and in ns; frames, before: numbers of left images from the instant on
     and before it.
     """
 
@@ -54,18 +54,17 @@ def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64)
     chosen = chosen_frame(log, times, at)
     earlier = chosen - _nearest(log, times, before) if isinstance(before, np.datetime64) else before
     low, end = max(0, chosen - earlier), min(times.size, chosen + frames)
-    second, stamp = (int(times[chosen]) - log.begin) / 1e9, _stamp(log, times, chosen)
+    stamp = _stamp(log, times, chosen)
     delay = int(times[chosen]) - stamp
     # The log is cut by stamps, unless these are of another clock.
     edges, numbers = edges_of(log, times - delay * (abs(delay) < MAX_LATENESS_NS)), (end - chosen, chosen - low)
-    return Part(edges[low], edges[end], second, *numbers, stamp, edges[chosen])
+    return Part(edges[low], edges[end], (stamp - log.first_stamp) / 1e9, *numbers, stamp, edges[chosen])
 
 
 def chosen_frame(log: McapLog, times: NDArray[np.int64], at: Instant) -> int:
     """The place of the left image at an instant; raises UsageError for one outside the images. times: log times, ns."""
     chosen = _nearest(log, times, at)
-    found = int(times[chosen]) if isinstance(at, float | int) else _stamp(log, times, chosen)
-    off = _ns(log, at) - found
+    off = ns_of(at, log.first_stamp) - _stamp(log, times, chosen)
     if (chosen == 0 and off < -ROUNDING) or (chosen == times.size - 1 and off > ROUNDING):
         raise UsageError(_outside(log, times, at))
     return chosen
@@ -91,11 +90,12 @@ def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
 
 def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:
     """The sentence that an instant is outside the images of a log. times: their log times, ns."""
+    ends = _stamp(log, times, 0), _stamp(log, times, -1)
     if isinstance(at, float | int):
-        first, last = ((int(time) - log.begin) / 1e9 for time in times[[0, -1]])
+        first, last = ((stamp - log.first_stamp) / 1e9 for stamp in ends)
         return f"--at {at:.12g} is outside the images of the log, which lie from {first:.3f} to {last:.3f} s"
-    given, *ends = map(_shown, (_ns(log, at), _stamp(log, times, 0), _stamp(log, times, -1)))
-    return f"--at {given} is outside the images of the log, which lie from {ends[0]} to {ends[1]}"
+    given, begin, end = map(_shown, (ns_of(at, log.first_stamp), *ends))
+    return f"--at {given} is outside the images of the log, which lie from {begin} to {end}"
 
 
 def _shown(stamp: int) -> str:
@@ -114,7 +114,7 @@ def is_other(log: McapLog, stamps: NDArray[np.int64]) -> bool:
 
 
 def ns_of(at: Instant, begin: int) -> int:
-    """An instant in ns, in a log that begins at `begin`, ns. Raises UsageError for what is none."""
+    """The stamp of an instant in a log that begins at the stamp `begin`, ns. Raises UsageError for what is none."""
     if isinstance(at, float | int) and abs(at) < MAX_SECONDS:
         return begin + round(at * 1e9)
     if not isinstance(at, np.datetime64 | np.timedelta64):
@@ -127,20 +127,13 @@ def ns_of(at: Instant, begin: int) -> int:
     return value
 
 
-def _ns(log: McapLog, at: Instant) -> int:
-    """The log time of an instant in seconds, the stamp of any other, ns."""
-    return ns_of(at, log.begin if isinstance(at, float | int) else log.first_stamp)
-
-
 def _nearest(log: McapLog, times: NDArray[np.int64], at: Instant) -> int:
     """The place of the left image nearest to an instant. times: log times, ns."""
-    when, absolute = _ns(log, at), not isinstance(at, float | int)
-    delay = sum(time - stamp for time, stamp in _stamps(log, times, 0, 0).items()) if absolute else 0
+    when = ns_of(at, log.first_stamp)
+    delay = sum(time - stamp for time, stamp in _stamps(log, times, 0, 0).items())
     chosen = int(np.argmin(np.abs(times - when - delay)))
-    if absolute:
-        near = _stamps(log, times, chosen)
-        chosen = int(np.searchsorted(times, min(near, key=lambda time: abs(near[time] - when), default=times[chosen])))
-    return chosen
+    near = _stamps(log, times, chosen)
+    return int(np.searchsorted(times, min(near, key=lambda time: abs(near[time] - when), default=times[chosen])))
 
 
 def _stamp(log: McapLog, times: NDArray[np.int64], place: int) -> int:
