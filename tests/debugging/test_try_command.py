@@ -11,7 +11,7 @@ import rerun as rr
 import stages
 from recordings.comparison.sweep import chart
 from recordings.comparison.text import moment
-from tests.conftest import FRAMES, SMALL, rewrite
+from tests.conftest import FRAMES, SMALL, rewrite, run_fast
 
 AT = ("--at", "0.5", "-p", "fast")
 RIGHT = "/stereo/right/image_rect_color"
@@ -135,9 +135,16 @@ def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_p
     words = ("-p", "fast", *SMALL, "-o", tmp_path / "b.rrd")
     output = said(0, "try", log, "--at", "0.5", "--frames", 3, *words).out
     assert "2 frames from 0.513 s on: " in output
-    assert "\nnote: 1 frame gave no result; roverflow run --start " in output
+    command = rf"roverflow run {re.escape(str(log))} --start \d\.\d+( --end \d\.\d+)? -o OTHER\.mcap says why\n"
+    assert re.search(rf"\nnote: 1 frame gave no result; {command}", output)
     why = refused("try", log, "--at", "1.05", *words)
-    assert "no frame was completed at 1.013 s: left unmatched; roverflow run --start " in why
+    assert re.search(rf"no frame was completed at 1\.013 s: left unmatched; {command}", why)
+    out = run_fast(tmp_path / "a-nav.mcap", log, code=3)
+    known = (
+        "1.013 s: left unmatched: the nearest right without a partner is 500 ms away, more than 5 ms (stereo.slop)\n"
+    )
+    for asked in (("why", out, "--cell", "3,0"), ("try", log, "--result", out, *words[2:])):
+        assert known in refused(*asked, "--at", "1.05")
 
 
 def test_a_comparison_ends_before_the_disk_is_full(traverse, tmp_path, said, monkeypatch):

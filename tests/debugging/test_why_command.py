@@ -21,7 +21,18 @@ from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import level_in, read_disparity, read_grid_map, read_occupancy_grid, read_point_cloud
 from stages import FuseRegion, Rectify, VisualOdometry
 from stages.data import Cell, PixelOrigin
-from tests.conftest import FRAMES, SMALL, an_hour_later, edit_of, halves, rewrite, roverflow, run_fast, slow
+from tests.conftest import (
+    FRAMES,
+    SMALL,
+    an_hour_later,
+    edit_of,
+    halves,
+    mcap_rows,
+    rewrite,
+    roverflow,
+    run_fast,
+    slow,
+)
 
 AT = 1.0
 OWN_STAGE = """
@@ -255,16 +266,56 @@ def test_a_regional_cell_names_the_frames_that_saw_it(traverse, fast_result, sai
         assert why_not in refused("why", fast_result, *late[:2], cell, *late[3:])
 
 
-def test_guessed_and_distant_points_are_no_part_of_a_regional_cell(traverse, tmp_path):
-    out = run_fast(tmp_path / "out.mcap", traverse, "--end", 0.8, "--set", "regional_cells.max_range=4 m")
+@pytest.fixture(scope="module")
+def first_frame(traverse, tmp_path_factory):
+    """The result of the first frame, with maps of 4 m, and the points in it."""
+    out = tmp_path_factory.mktemp("first") / "out.mcap"
+    ranges = ("--set", "cells.max_range=4 m", "--set", "regional_cells.max_range=4 m")
+    run_fast(out, traverse, "--end", 0.8, *ranges)
     ((_, stamp, cloud), (_, _, transforms)) = iter_decoded(out, ["/nav/points", "/tf"])
     fields, level = read_point_cloud(cloud), level_in([transforms], "odom")
+    return out, np.datetime64(stamp, "ns"), fields, level
+
+
+def test_guessed_and_distant_points_are_no_part_of_a_regional_cell(first_frame):
+    out, stamp, fields, level = first_frame
     cells = np.floor(level(np.column_stack([fields[axis] for axis in "xyz"]))[:, :2] / 0.05)
     guessed, distant = fields["source"] != PixelOrigin.MEASURED, np.hypot(fields["x"], fields["y"]) > 4.1
     for others in (guessed, distant):
         alone = set(map(tuple, cells[others].tolist())) - set(map(tuple, cells[~others].tolist()))
         x, y = 0.05 * (np.array(min(alone, key=lambda cell: np.hypot(*cell))) + 0.5)
-        assert why_regional(out, np.datetime64(stamp, "ns"), (x, y)).frames == []
+        assert why_regional(out, stamp, (x, y)).frames == []
+
+
+def test_points_beyond_the_range_of_a_map_are_named(traverse, first_frame, said):
+    out, stamp, fields, _ = first_frame
+    beyond = (fields["x"] < 3.95) & (np.hypot(fields["x"], fields["y"]) > 4.1)
+    beyond &= fields["source"] == PixelOrigin.MEASURED
+    place = np.flatnonzero(beyond)[0]
+    cell = f"--cell={fields['x'][place]},{fields['y'][place]}"
+    output = said(0, "why", out, "--at", stamp.astype(int), cell, "--log", traverse).out
+    assert output.startswith("note: the measured points of the cell lie beyond cells.max_range, 4 m from base_link\n")
+    assert "unknown, reason unobserved\nno height, so no limit applies\n" in output
+
+
+def test_a_frame_that_the_result_does_not_have_is_noted(traverse, first_frame):
+    out, stamp, *_ = first_frame
+    found, only = why(out, 1.0, cell=(3, 0), log=traverse), moment(int(stamp.astype(int)))
+    note = f"note: the result has no 'navigation_map' at {moment(found.stamp)}; its maps are from {only} to {only}"
+    assert (found.notes, found.recorded) == ([note], None)
+    assert not why(out, 0.5, cell=(3, 0), log=traverse).notes
+
+
+def test_a_frame_without_a_map_names_what_it_lost(traverse, tmp_path, refused):
+    times = {"/imu/inclinometer": [row[3] for row in mcap_rows(traverse) if row[0] == "/imu/inclinometer"]}
+
+    def change(topic, index, data):
+        return data if topic not in times or abs(times[topic][index] - times[topic][0] - 10**9) > 4e8 else None
+
+    log = rewrite(traverse, tmp_path / "in.mcap", change)
+    out = run_fast(tmp_path / "out.mcap", log, code=3)
+    lost = "the frame at 1.013 s has no navigation map 'navigation_map': tilt unaligned: inclinometer has a gap of "
+    assert lost in refused("why", out, "--at", 1.0, "--cell", "3,0")
 
 
 @pytest.mark.parametrize("stream", ["pose", "health/frames"])

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from flow.cli.debugging.instants import Instant, no_frame, part_of
-from flow.cli.debugging.result_input import graph_of, input_of
+from flow.cli.debugging.result_input import graph_of, input_of, loss_at
 from flow.cli.replay import one_thread_per_call
 from flow.contracts import FrameRecord
 from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from flow.runtime.run import run
-from stages import Binarise
+from stages import Binarise, Voxelise
 from stages.data import (
     Array,
     Cell,
@@ -69,7 +69,8 @@ class CellExplanation:
     turns : list of Turn
         The smallest change of each parameter that would change the verdict.
     notes : list of str
-        What differs from the question: another form of the input log, another instant.
+        What differs from the question: another form of the input log, another instant, a frame that the result does not
+        have, a cell beyond the range of the map.
     """
 
     stream: str
@@ -174,9 +175,7 @@ def why(
         raise UsageError(f"the pipeline has {others}")
     graph = graph.upstream_of([stream])
     with loading_kernels(), input_of(graph, result, log) as (opened, notes):
-        items = instant(graph, opened, at)
-    if stream not in items:
-        raise UsageError(f"the frame has no navigation map '{stream}'; run the log again to see what it lacks")
+        items = instant(graph, opened, at, stream, result)
     node, navigation = rules[stream], items[stream]
     terrain = items[node.inputs["elevation"]]
     cloud = _last(items, PointCloud, navigation.frame_id)
@@ -187,14 +186,15 @@ def why(
     if place is None:
         raise UsageError(f"({x:.5g}, {y:.5g}) is outside the map, which has {_extent(navigation)}")
     x, y = centre_of(navigation, place)
+    recorded, lacking = _recorded(result, stream, navigation.stamp, x, y)
     cells = np.floor((cloud.points[:, :2] - np.array(navigation.origin)) / navigation.resolution)
     inside = (cells == place[::-1]).all(axis=1)
     frame, origin = _last(items, StereoFrame), np.zeros(3) if cloud.sensor is None else cloud.sensor.translation
     return Explanation(
         **verdict_at(node.actor, navigation, terrain, place),
         stream=stream,
-        notes=notes,
-        recorded=_recorded(result, stream, navigation.stamp, x, y),
+        notes=[*notes, *lacking, *_beyond(graph, cloud, inside)],
+        recorded=recorded,
         distance=float(np.median(np.linalg.norm(cloud.points[inside] - origin, axis=1))) if inside.any() else math.nan,
         tilt=_last(items, Tilt),
         image=np.zeros((0, 0), np.uint8) if frame is None else frame.left,
@@ -254,16 +254,24 @@ def _costs(items: Mapping[str, Any], pixels: Array) -> Array:
     return np.zeros((2, 0), np.uint8)
 
 
-def instant(graph: Graph, log: McapLog, at: Instant) -> Mapping[str, Any]:
-    """Every stream of a graph at the frame of a log nearest to `at`. Raises UsageError if no frame goes through."""
+def instant(graph: Graph, log: McapLog, at: Instant, stream: str, result: Path) -> Mapping[str, Any]:
+    """Every stream of a graph at the frame of a log nearest to `at`.
+
+    Raises UsageError with the loss if the frame has no `stream`. result: log of the whole run.
+    """
     kept = _Keep()
     with one_thread_per_call():
         part = part_of(log, at, frames=1, before=0)
         log.narrow(part.start, part.end)
         summary = run(replace(graph, sinks=(("keep", kept),)), log, {"keep": Path("memory")})
-    if not kept.records:
-        raise no_frame(part, summary)
-    return kept.records[0].items
+    items = kept.records[0].items if kept.records else {}
+    if stream in items:
+        return items
+    loss = loss_at(part.stamp, summary["ledger"], result)
+    if not items:
+        raise no_frame(part, loss, log)
+    why = "the pipeline returned none" if loss is None else loss.words
+    raise UsageError(f"the frame at {part.at:.3f} s has no navigation map '{stream}': {why}")
 
 
 @dataclass
@@ -336,13 +344,28 @@ def _extent(navigation: NavigationMap) -> str:
     return f"x {x:.2f} to {x + cols * step:.2f} m, y {y:.2f} to {y + rows * step:.2f} m in '{navigation.frame_id}'"
 
 
-def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> Cell | None:
-    """The verdict of the result at a place."""
-    from recordings.mcap.file import iter_decoded
+def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> tuple[Cell | None, list[str]]:
+    """The verdict of the result at a place, None without one; and a note if the result has no map of the stamp."""
+    from recordings.comparison.text import moment
+    from recordings.mcap.file import McapFile, iter_decoded
     from recordings.ros2.from_msg import read_occupancy_grid
 
-    for _, _, message in iter_decoded(result, [f"/nav/{stream}"], Counter(), part=(stamp, stamp + 1)):
+    topic = f"/nav/{stream}"
+    for _, _, message in iter_decoded(result, [topic], Counter(), part=(stamp, stamp + 1)):
         navigation = read_occupancy_grid(message)
         place = index_of(navigation, x, y)
-        return None if place is None else Cell(int(navigation.cells[place]))
-    return None
+        return None if place is None else Cell(int(navigation.cells[place])), []
+    with McapFile(result) as log:
+        stamps = log.times(log.channels_of([topic])).tolist()
+    those = f"; its maps are from {moment(stamps[0])} to {moment(stamps[-1])}" if stamps else ", nor at any other"
+    return None, [f"note: the result has no '{stream}' at {moment(stamp)}{those}"]
+
+
+def _beyond(graph: Graph, cloud: PointCloud, inside: Array) -> list[str]:
+    """A note if the measured points of a cell are all beyond the range of the map. inside: mask of its points."""
+    ranges = [(node.name, node.actor.max_range) for node in graph.nodes if isinstance(node.actor, Voxelise)]
+    distances = np.linalg.norm(cloud.points[inside & cloud.measured, :2], axis=1)
+    name, max_range = ranges[-1] if ranges else ("", math.inf)
+    if not distances.size or distances.min() <= max_range:
+        return []
+    return [f"note: the measured points of the cell lie beyond {name}.max_range, {max_range:g} m from base_link"]

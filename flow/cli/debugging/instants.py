@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shlex
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flow.cli.arguments import MAX_SECONDS
-from flow.contracts import LossReason
 from flow.errors import UsageError
 from recordings.containers.container import RawMessage
 from recordings.containers.time_range import MAX_LATENESS_NS
@@ -40,6 +40,19 @@ class Part:
     before: int
     stamp: int
     first: float
+
+
+class FrameLoss(NamedTuple):
+    """A loss of a frame. detail: one sentence, empty if unknown."""
+
+    stream: str
+    reason: str
+    detail: str
+
+    @property
+    def words(self) -> str:
+        """The loss in words."""
+        return f"{self.stream} {self.reason}" + (f": {self.detail}" if self.detail else "")
 
 
 def part_of(log: McapLog, at: Instant, frames: int, before: int | np.datetime64) -> Part:
@@ -76,16 +89,18 @@ def edges_of(log: McapLog, times: NDArray[np.int64]) -> list[float]:
     return [(edge - log.begin) / 1e9 for edge in edges.tolist()]  # stamps may precede the log's first message
 
 
-def no_frame(part: Part, summary: Mapping[str, Any]) -> UsageError:
-    """The error for a part whose run gave no frame, with the loss at its stamp. summary: of that run.
+def no_frame(part: Part, loss: FrameLoss | None, log: McapLog) -> UsageError:
+    """The error for a part whose run gave no frame. loss: at its stamp."""
+    why = "" if loss is None else f": {loss.words}"
+    remedy = "" if loss is not None and loss.detail else f"; {run_from(log, part)} says why"
+    return UsageError(f"no frame was completed at {part.at:.3f} s{why}{remedy}")
 
-    It does not say why a partner did not come: the part ends before it could.
-    """
-    lost = [entry for entry in summary["ledger"] if entry["stamp"] == part.stamp]
-    details = ("" if entry["reason"] == LossReason.UNMATCHED else f" ({entry['detail']})" for entry in lost)
-    losses = [f": {entry['stream']} {entry['reason']}{detail}" for entry, detail in zip(lost, details, strict=True)]
-    begin = f"roverflow run --start {max(0, part.first):.3f} says why"
-    return UsageError(f"no frame was completed at {part.at:.3f} s{''.join(losses[:1])}; {begin}")
+
+def run_from(log: McapLog, part: Part, end: float | None = None) -> str:
+    """The command that runs a log from the instant on. end: s after the log's first message."""
+    files = [log.given] if isinstance(log.given, Path | str) else log.given
+    until = "" if end is None else f" --end {end:.3f}"
+    return f"roverflow run {shlex.join(map(str, files))} --start {max(0, part.first):.3f}{until} -o OTHER.mcap"
 
 
 def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:

@@ -1,17 +1,19 @@
-"""The pipeline and the input log of a result log, to run frames of it again."""
+"""The pipeline and the input log of a result log, to run frames of it again, and the losses of its frames."""
 
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from flow.cli.debugging.instants import is_other
+from flow.cli.debugging.instants import FrameLoss, is_other
 from flow.cli.report import say
 from flow.config.loader import load
+from flow.contracts import LossReason
 from flow.errors import RoverflowError, UsageError
 from flow.runtime.graph import Graph
 
@@ -96,3 +98,32 @@ def check_input(opened: McapLog, given: Sequence[Path], result: Path, remedy: st
         raise UsageError(f"{names} is not the input of {result}: its frames have other stamps{remedy}")
     note = f"note: {names} has other bytes than the input of {result}, but the same stamps"
     return [] if digest is None else [note]
+
+
+def loss_at(stamp: int, ledger: Sequence[Mapping[str, Any]], result: Path | None) -> FrameLoss | None:
+    """The first loss at a stamp, ns, in the ledger of a part's run; None without one.
+
+    result: log of the whole run, whose ledger has the details. That of a part does not say why a partner did not come,
+    because the part ends before it could.
+    """
+    own = [
+        FrameLoss(entry["stream"], entry["reason"], "" if entry["reason"] == LossReason.UNMATCHED else entry["detail"])
+        for entry in ledger
+        if entry["stamp"] == stamp
+    ]
+    whole = [] if result is None else _logged_losses(result, stamp)
+    same = [loss for loss in whole if loss[:2] in {one[:2] for one in own}]
+    return next(iter(same or own or whole), None)
+
+
+def _logged_losses(result: Path, stamp: int) -> list[FrameLoss]:
+    """The losses at a stamp, ns, in the diagnostics of a result log; they may be at another stamp."""
+    from recordings.mcap.file import iter_decoded
+
+    losses = list[FrameLoss]()
+    for _, _, message in iter_decoded(result, ["/nav/diagnostics"], Counter()):
+        for status in getattr(message, "status", ()):
+            found = {pair.key: pair.value for pair in status.values}
+            if found.get("stamp") == str(stamp) and "reason" in found:
+                losses.append(FrameLoss(found["stream"], found["reason"], status.message))
+    return losses

@@ -7,9 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from flow.cli.debugging.instants import Instant, Part, no_frame, part_of
+from flow.cli.debugging.instants import Instant, Part, no_frame, part_of, run_from
 from flow.cli.debugging.logged_state import resume
-from flow.cli.debugging.result_input import graph_of
+from flow.cli.debugging.result_input import graph_of, loss_at
 from flow.cli.debugging.variants import Variants, VariantSink, merged, sink_of
 from flow.cli.replay import ARROW_EXTRA, RESULT_TYPES, one_thread_per_call, product_version
 from flow.config.loader import load
@@ -95,15 +95,16 @@ def run_variants(
         summary = run(ran, log, paths, workers=workers, about=about, states=states)
     through = stamps_of(paths["A"], results=True).size if all(path.exists() for path in paths.values()) else 0
     if not through:
-        raise no_frame(part, summary)
+        whole = pipeline if isinstance(pipeline, Path) else None
+        raise no_frame(part, loss_at(part.stamp, summary["ledger"], whole), log)
     for label, names in variants.names.items():
         lost = [one for one in summary["ledger"] if one["stage"] in names.values() and one["stamp"] >= part.stamp]
         if lost:
             frames_lost = counted(len({one["stamp"] for one in lost}), "frame")
             notes.append(f"note: {label} lost {frames_lost}, first in {lost[0]['stage']}: {lost[0]['detail']}")
     if through < part.frames:
-        says_why = f"roverflow run --start {max(0, part.first):.3f} --end {part.end:.3f} says why"
-        notes.append(f"note: {counted(part.frames - through, 'frame')} gave no result; {says_why}")
+        without = counted(part.frames - through, "frame")
+        notes.append(f"note: {without} gave no result; {run_from(log, part, part.end)} says why")
     return paths, variants, replace(part, frames=through), notes
 
 
