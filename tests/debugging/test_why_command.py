@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flow.cli.debugging.explanation import why
+from flow.cli.debugging.explanation import index_of, why
 from flow.cli.debugging.instants import part_of
 from flow.cli.debugging.regional_explanation import why_regional
 from flow.cli.debugging.result_input import graph_of
@@ -20,7 +20,7 @@ from recordings.comparison.text import moment
 from recordings.mcap.file import iter_decoded
 from recordings.ros2.from_msg import level_in, read_disparity, read_grid_map, read_occupancy_grid, read_point_cloud
 from stages import FuseRegion, Rectify, VisualOdometry
-from stages.data import Cell, PixelOrigin
+from stages.data import Cell, NavigationMap, PixelOrigin
 from tests.conftest import (
     FRAMES,
     SMALL,
@@ -316,6 +316,16 @@ def test_a_frame_without_a_map_names_what_it_lost(traverse, tmp_path, refused):
     out = run_fast(tmp_path / "out.mcap", log, code=3)
     lost = "the frame at 1.013 s has no navigation map 'navigation_map': tilt unaligned: inclinometer has a gap of "
     assert lost in refused("why", out, "--at", 1.0, "--cell", "3,0")
+
+
+def test_a_place_on_a_border_is_in_one_cell_of_every_map():
+    cells = np.zeros((400, 400), np.int8)
+    for border in (-0.6, 3.4, *(0.05 * np.arange(-20, 20))):
+        found = set()
+        for first in range(-200, -150):
+            grid = NavigationMap(0, cells, cells.astype(np.uint8), 0.05, (first * 0.05, first * 0.05), "odom")
+            found.add(tuple(first + place for place in index_of(grid, border, border)))
+        assert found == {(round(border / 0.05),) * 2}
 
 
 @pytest.mark.parametrize("stream", ["pose", "health/frames"])

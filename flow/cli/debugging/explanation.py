@@ -41,6 +41,7 @@ from stages.terrain.verdict_limits import Limit, Turn, doubts_at, limits_at, tur
 if TYPE_CHECKING:
     from recordings.source.log import McapLog
 
+BORDER_DIGITS = 6  # of a cell, to which a place is rounded
 REACH_PX = 10.0  # from a pixel to the nearest one that has a point
 
 
@@ -324,8 +325,9 @@ def _place(cloud: PointCloud, pixel: tuple[int, int] | None) -> tuple[float, flo
 
 def index_of(navigation: NavigationMap, x: float, y: float) -> tuple[int, int] | None:
     """Row and column of the cell at (x, y); None outside the map."""
-    offsets = (y - navigation.origin[1], x - navigation.origin[0])
-    row, col = (float(np.floor(offset / navigation.resolution)) for offset in offsets)  # which may be infinite
+    offsets = (float(y - navigation.origin[1]), float(x - navigation.origin[0]))
+    # A border belongs to the cell above it, whatever the error of the origin. The quotients may be infinite.
+    row, col = (float(np.floor(round(offset / navigation.resolution, BORDER_DIGITS))) for offset in offsets)
     rows, cols = navigation.cells.shape
     return (int(row), int(col)) if 0 <= row < rows and 0 <= col < cols else None
 
