@@ -12,6 +12,7 @@ from stages.data import Cell, ElevationMap
 from stages.terrain.binarise import Binarise
 
 FACTORS = tuple(1.01**step for step in range(1, 232))  # by which a parameter is changed, up to ten times its value
+MAX_DIGITS = 12  # of a value
 _LIMITS = ("max_step", "ground_clearance", "max_slope")  # of the rover
 
 
@@ -26,7 +27,10 @@ class Limit(NamedTuple):
 
 @dataclass(frozen=True)
 class Turn:
-    """A change of one parameter of the hazard rule that would turn a verdict. The values have the parameter's unit."""
+    """A change of one parameter of the hazard rule that would turn a verdict. The values have the parameter's unit.
+
+    needed: rounded away from `now` to as few digits, three at least, as turn it; an angle in degrees.
+    """
 
     parameter: str
     now: float
@@ -86,8 +90,22 @@ def turns_at(rule: Binarise, terrain: ElevationMap, row: int, col: int) -> list[
         known = [change for change in changes if change is not None]
         if known:
             factor, turned = min(known, key=lambda change: abs(math.log(change[0])))
-            found.append((abs(math.log(factor)), Turn(name, value, _like(value, value * factor), unit, turned)))
+            turn = Turn(name, value, _like(value, value * factor), unit, turned)
+            found.append((abs(math.log(factor)), _rounded(turn, rule, (terrain, row, col))))
     return [turn for _, turn in sorted(found, key=lambda item: item[0])]
+
+
+def _rounded(turn: Turn, rule: Binarise, place: tuple[ElevationMap, int, int]) -> Turn:
+    """A turn with a value that can be typed."""
+    into, back = (math.degrees, math.radians) if turn.unit == "rad" else (float, float)
+    needed = into(turn.needed)
+    for digits in range(3, MAX_DIGITS) if isinstance(turn.now, float) else ():
+        step = 10.0 ** (math.floor(math.log10(needed)) + 1 - digits)
+        typed = (math.ceil if turn.needed > turn.now else math.floor)(needed / step) * step
+        value = back(float(f"{typed:.{digits}g}"))
+        if _verdict(rule, turn.parameter, value, *place) == turn.verdict:
+            return replace(turn, needed=value)
+    return turn
 
 
 def _turned(

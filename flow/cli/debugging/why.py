@@ -178,11 +178,9 @@ def _against(name: str, found: Limit) -> str:
 
 
 def _change(stream: str, turn: Turn) -> str:
-    """A change as --set takes it; its number is rounded away from the present one, so that it still turns."""
-    (needed, unit), (now, _) = _in_words(turn.needed, turn.unit), _in_words(turn.now, turn.unit)
-    step = 10.0 ** (math.floor(math.log10(needed)) - 2)
-    needed = (math.ceil if needed > now else math.floor)(needed / step) * step
-    return f"{stream}.{turn.parameter} = {_shown(needed, unit)} (now {_shown(now, unit)})"
+    """A change as --set takes it, with all digits of its number."""
+    needed, unit = _in_words(turn.needed, turn.unit)
+    return f"{stream}.{turn.parameter} = {f'{needed:.12g} {unit}'.strip()} (now {_shown(turn.now, turn.unit)})"
 
 
 def _shown(value: float, unit: str) -> str:

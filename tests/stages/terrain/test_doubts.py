@@ -42,6 +42,17 @@ def test_a_wall_that_the_edge_of_view_cuts_far_away_names_its_doubt():
     assert (short.cells[row, col], enough.cells[row, col]) == (Cell.UNKNOWN, turn.verdict) == (-1, 0)
 
 
+def test_a_needed_value_has_the_digits_that_turn_the_verdict():
+    flat = np.zeros((9, 9))
+    layers = dict.fromkeys(("ground", "step", "roughness"), flat) | {"support": np.ones(flat.shape)}
+    slope, steepness = (np.full(flat.shape, np.radians(angle)) for angle in (10.132, 10.312))
+    terrain, rule = map_of(flat, **layers, slope=slope, steepness=steepness), Binarise()
+    (turn,) = (turn for turn in turns_at(rule, terrain, 4, 4) if turn.parameter == "rover.max_slope")
+    assert (np.degrees(turn.needed), turn.verdict) == (pytest.approx(10.26, abs=1e-12), Cell.UNKNOWN)
+    changed = replace(rule, rover=replace(rule.rover, max_slope=turn.needed))
+    assert changed(terrain).cells[4, 4] == Cell.UNKNOWN
+
+
 @pytest.mark.parametrize(
     ("cells", "drop", "step", "free"),
     [(6, 0.05, 0.06, False), (5, 0.05, 0.06, True), (6, 0.02, 0.06, True), (6, 0.05, 0.03, True)],
