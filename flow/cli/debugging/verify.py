@@ -73,7 +73,8 @@ def _second_run(options: argparse.Namespace, about: Mapping[str, str], stated: M
         say("\n".join([*notes, f"{topics} the same in a second run of {names_of(logs)}"]))
         return COMPLETE
     keep = f"roverflow diff {result} {again}" if options.out else "-o AGAIN.mcap keeps the second result"
-    say("\n".join([*notes, f"different in a second run: {', '.join(differing)}", _versions(about), keep]))
+    other = f" of {names_of(logs)}, which may be another log" if notes else ""
+    say("\n".join([*notes, f"different in a second run{other}: {', '.join(differing)}", _versions(about), keep]))
     return DIFFERENT
 
 
