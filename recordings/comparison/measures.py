@@ -7,8 +7,9 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy_grid
+from recordings.ros2.from_msg import read_disparity, read_layers, read_occupancy_grid, read_point_cloud
 from recordings.ros2.plain import array_of
 from stages.data import Array, Cell, NavigationMap
 
@@ -138,7 +139,22 @@ def _poses(one: Any, other: Any) -> Measures:
 
 
 def _points(one: Any, other: Any) -> Measures:
-    return {"points more or fewer": float(abs(one.width * one.height - other.width * other.height))}
+    """The distances from each point to the nearest one of the other cloud: a log keeps no pairs of points."""
+    found = {"points more or fewer": float(abs(one.width * one.height - other.width * other.height))}
+    first, second = map(_places, (one, other))
+    if not (len(first) and len(second)):
+        return found
+    apart = np.concatenate([KDTree(second).query(first)[0], KDTree(first).query(second)[0]])
+    moved = 100 * apart[apart > 0]
+    sizes = {"median": np.median(moved), "largest": np.max(moved)} if moved.size else {}
+    return found | {f"{name} distance to the nearest point cm": float(value) for name, value in sizes.items()}
+
+
+def _places(message: Any) -> Array:
+    """The finite points of a cloud, (N, 3) float64, m."""
+    fields = read_point_cloud(message)
+    points = np.column_stack([fields[axis] for axis in "xyz"]).astype(np.float64)
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _differ(one: Array, other: Array) -> Array:

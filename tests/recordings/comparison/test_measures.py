@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from recordings.comparison.measures import measures
-from recordings.ros2.to_msg import disparity_image, grid_map, image, occupancy_grid, odometry
+from recordings.ros2.to_msg import disparity_image, grid_map, image, occupancy_grid, odometry, point_cloud
 from stages.data import Pose
 from tests.recordings.sinks.recorded_scene import scene
 
@@ -60,3 +60,21 @@ def test_maps_far_apart_are_of_another_place():
     verdicts = scene()["navigation_map"]
     pair = occupancy_grid(verdicts), occupancy_grid(replace(verdicts, origin=(2e4, 2e4)))
     assert measures("nav_msgs/msg/OccupancyGrid", *pair) == {"cells of another place": verdicts.cells.size}
+
+
+def test_clouds_differ_by_the_distances_to_the_nearest_points():
+    cloud = scene()["points"]
+    moved = cloud.points.copy()
+    moved[0] += np.float32([0, 0, 50])
+    found = measures("sensor_msgs/msg/PointCloud2", *map(point_cloud, (cloud, replace(cloud, points=moved))))
+    assert found["largest distance to the nearest point cm"] == pytest.approx(5000, rel=0.2)
+    raised = replace(cloud, points=cloud.points + np.float32([0, 0, 0.001]))
+    found = measures("sensor_msgs/msg/PointCloud2", *map(point_cloud, (cloud, raised)))
+    assert set(found) == {f"{name} distance to the nearest point cm" for name in ("median", "largest")}
+    assert found["largest distance to the nearest point cm"] == pytest.approx(0.1, rel=1e-2)
+    fewer = cloud.only(np.arange(len(cloud.points)) != 3)
+    found = measures("sensor_msgs/msg/PointCloud2", *map(point_cloud, (cloud, fewer)))
+    assert found["points more or fewer"] == 1
+    nothing = cloud.only(np.zeros(len(cloud.points), bool))
+    found = measures("sensor_msgs/msg/PointCloud2", *map(point_cloud, (cloud, nothing)))
+    assert found == {"points more or fewer": len(cloud.points)}
