@@ -184,6 +184,18 @@ def test_info_uses_the_settings_of_the_pipeline(traverse, tmp_path, said):
     assert "odometry" not in streams("-p", pipeline, code=2)
 
 
+def test_pairs_in_a_gap_of_the_poses_are_damage(tmp_path, said):
+    log = write_sample(tmp_path / "log.mcap", dropped("/odom", numbers=[1, 2, 3]))
+    output = said(3, "info", log, "--set", "logged.max_gap=350ms").out
+    assert "; 2 stereo pairs with a pose; " in output
+    assert (
+        "\ndamaged: 3 of 5 stereo pairs in a gap of the poses, over 0.35 s long; a run loses the pose there\n" in output
+    )
+    assert "; 5 stereo pairs with a pose; " in said(0, "info", log).out
+    early = write_sample(tmp_path / "early.mcap", dropped("/odom", numbers=[0, 1]))
+    assert "; 3 stereo pairs with a pose; " in said(0, "info", early).out  # before the first pose is no gap
+
+
 def test_info_counts_pairs_and_tilts_by_the_pipeline(tmp_path, said):
     edit = changed((RIGHT, TILT), {"header.stamp.nanosec": lambda time: time + 8_000_000})
     log, pipeline = write_sample(tmp_path / "log.mcap", edit), tmp_path / "named.yaml"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.discovery.discover import VISUAL
-from recordings.inventory.poses import describe_poses
+from recordings.inventory.poses import MaxGapOf, describe_poses, gap_sentence, sampled
 from recordings.inventory.search_range import UPSIDE_DOWN, search_range
 from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory
@@ -44,13 +43,16 @@ class Damage(dict[str, tuple[int, str]]):
 
 
 def describe(
-    log: McapLog, slop: int = 5_000_000, max_gap_of: Callable[[Sequence[int]], int] | None = None
+    log: McapLog,
+    slop: int = 5_000_000,
+    max_gap_of: MaxGapOf | None = None,
+    max_pose_gap_of: MaxGapOf | None = None,
 ) -> dict[str, Any]:
     """The inventory of an opened log as plain JSON values.
 
     Pairs and tilts are counted by their stamps alone; a run may also lose messages that were logged too late. slop:
     largest difference between the stamps of the two images of a frame, ns; max_gap_of: from the intervals of the tilts,
-    ns, to the largest one around a frame; None: do not count frames with a tilt.
+    ns, to the largest one around a frame; None: do not count frames with a tilt; max_pose_gap_of: the same of poses.
     """
     resolution, lost = log.resolution, log.file.lost
     damage = Damage()
@@ -62,7 +64,14 @@ def describe(
     distinct = {stream: _distinct(log, stream, damage, stamps[stream]) for stream in stamps}
     left, right = (_calibrated(log, side, damage, distinct[side]) for side in CAMERAS)
     tilts = distinct["inclinometer"]
+    pairs = _pairs(left, right, slop)
     max_gap = None if max_gap_of is None else max_gap_of(np.diff(tilts).tolist())
+    (with_tilt, _), (tilted_pairs, in_gap) = (
+        (None, 0) if max_gap is None else sampled(of, tilts, max_gap) for of in (left, pairs)
+    )
+    if in_gap and tilted_pairs:
+        damage.add(gap_sentence(in_gap, pairs, "tilts", max_gap))
+    poses = describe_poses(log, left, pairs, _is_verified(log), max_pose_gap_of, damage.add)
     return {
         "path": str(log.path),
         "result": _run(log),
@@ -80,16 +89,17 @@ def describe(
         "frames": {
             "left": len(stamps["left"]),
             "right": len(stamps["right"]),
-            "pairs": _pairs(left, right, slop),
+            "pairs": pairs.size,
             "slop_s": slop / 1e9,
             "pair_offset_s": _offset(*sorted((left, right), key=len)),
-            "with_tilt": None if max_gap is None else _tilted(left, tilts, max_gap),
+            "with_tilt": with_tilt,
+            "pairs_with_tilt": tilted_pairs,
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
             "delay_s": [float(np.quantile(delays, part)) / 1e9 for part in (0, 0.5, 1)] if delays else None,
             "tilt_delay_s": float(np.median(of_tilts)) / 1e9 if of_tilts else None,
             "tilt_offset_s": log.time_offset("inclinometer") / 1e9,
         },
-        "poses": describe_poses(log, left, _is_verified(log), damage.add),
+        "poses": poses,
         "transforms": resolution.static.listed(),
         "mount": _mount(log),
         "search_range": _search_range(log),
@@ -205,15 +215,16 @@ def _calibrated(log: McapLog, side: str, damage: Damage, stamps: Stamps) -> Stam
     return np.array([stamp for stamp, error in errors.items() if error is None], np.int64)
 
 
-def _pairs(left: Stamps, right: Stamps, slop: int) -> int:
-    """The number of left images with a right one within the slop; each right image is used once."""
-    pairs = place = 0
+def _pairs(left: Stamps, right: Stamps, slop: int) -> Stamps:
+    """The stamps of the left images with a right one within the slop; each right image is used once."""
+    pairs, place = array("q"), 0
     for stamp in left.tolist():
         while place < right.size and right[place] < stamp - slop:
             place += 1
         if place < right.size and right[place] <= stamp + slop:
-            pairs, place = pairs + 1, place + 1
-    return pairs
+            pairs.append(stamp)
+            place += 1
+    return np.asarray(pairs, np.int64)
 
 
 def _offset(fewer: Stamps, more: Stamps) -> float | None:
@@ -227,17 +238,6 @@ def _offset(fewer: Stamps, more: Stamps) -> float | None:
     nearest = [np.abs(more[np.clip(place, 0, more.size - 1)] - fewer) for place in (after - 1, after)]
     offset = float(np.quantile(np.minimum(*nearest), 0.9))
     return offset / 1e9 if offset < np.median(np.diff(fewer)) / 4 else None
-
-
-def _tilted(left: Stamps, tilt: Stamps, max_gap: int) -> int:
-    """The number of left images at the stamp of a tilt, or between two that are close enough to interpolate."""
-    if not tilt.size:
-        return 0
-    after = np.searchsorted(tilt, left)
-    inside = after < tilt.size
-    later = tilt[np.minimum(after, tilt.size - 1)]
-    earlier = tilt[np.maximum(after - 1, 0)]
-    return int(np.sum(inside & ((later == left) | ((after > 0) & (later - earlier <= max_gap)))))
 
 
 def _calibration(log: McapLog) -> dict[str, Any] | None:

@@ -32,7 +32,7 @@ def format_description(description: dict[str, Any]) -> str:
         )
         lines += [f"doubtful: {doubt}" for doubt in camera["doubts"]]
     if all(side in d["streams"] for side in CAMERAS):
-        lines.append(_frame_line(d["frames"]))
+        lines.append(_frame_line(d["frames"], d["poses"]))
         lines += [f"doubtful: {doubt}" for doubt in (*_stamp_doubts(d["frames"]), *_pose_doubts(d))]
     if d["mount"]:
         base, position = d["mount"]["base"], [round(value, 4) for value in d["mount"]["position"] or ()]
@@ -105,14 +105,17 @@ def _table(topics: list[dict[str, Any]], roles: dict[str, str]) -> list[str]:
     ]
 
 
-def _frame_line(frames: dict[str, Any]) -> str:
+def _frame_line(frames: dict[str, Any], poses: dict[str, Any] | None) -> str:
     line = (
         f"frames: {counted(frames['pairs'], 'stereo pair')} (stamps within {frames['slop_s'] * 1e3:g} ms) from "
         f"{counted(frames['left'], 'left image')} and {counted(frames['right'], 'right image')}"
     )
     if frames["with_tilt"] is not None:
-        gap = f" (readings at most {frames['tilt_gap_s'] * 1e3:g} ms apart)" if frames["with_tilt"] else ""
-        line += f"; {counted(frames['with_tilt'], 'left image')} with a tilt{gap}"
+        gap = f" (readings at most {frames['tilt_gap_s'] * 1e3:g} ms apart)"
+        more = f"{gap}, {frames['pairs_with_tilt']} of them in pairs" if frames["with_tilt"] else ""
+        line += f"; {counted(frames['with_tilt'], 'left image')} with a tilt{more}"
+    if poses is not None and poses["pairs_with_pose"] is not None:
+        line += f"; {counted(poses['pairs_with_pose'], 'stereo pair')} with a pose"
     if frames["delay_s"]:
         unit, scale, form = ("ms", 1e3, ".3g") if max(map(abs, frames["delay_s"])) < 1 else ("s", 1.0, ".1f")
         least, median, most = (format(scale * delay, form) for delay in frames["delay_s"])

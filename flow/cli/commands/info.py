@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, write_text
 from flow.cli.report import say
 from flow.errors import COMPLETE, INCOMPLETE, UNUSABLE, UsageError
 from flow.runtime.graph import Graph
 from recordings.containers.finding import find_files
+
+if TYPE_CHECKING:
+    from recordings.inventory.poses import MaxGapOf
 
 HELP = "show what a log contains, and what is missing"
 
@@ -77,16 +79,16 @@ def _caveat(graph: Graph, frames: dict[str, Any]) -> str:
     return "no frame has tilt readings near enough in time" if frames["with_tilt"] == 0 else ""
 
 
-def _tolerances(graph: Graph) -> tuple[int, Callable[[Sequence[int]], int] | None]:
-    """The pipeline's slop between left and right, ns, and the function from the intervals of the tilt to its largest
-    gap, ns (None: not interpolated)."""
+def _tolerances(graph: Graph) -> tuple[int, MaxGapOf | None, MaxGapOf | None]:
+    """The pipeline's slop between left and right, ns, and for tilts and poses the function from their intervals to the
+    largest gap, ns (None: not interpolated)."""
     from flow.align import Interpolate, Pair
 
     slop: int = Pair.slop
-    max_gap: Callable[[Sequence[int]], int] | None = None
+    max_gaps: dict[str, MaxGapOf] = {}
     for node in graph.aligners:
         if isinstance(node.actor, Pair) and {*node.inputs.values()} == {"left", "right"}:
             slop = node.actor.slop
-        if isinstance(node.actor, Interpolate) and node.inputs["stream"] == "inclinometer":
-            max_gap = node.actor.max_gap_of
-    return slop, max_gap
+        if isinstance(node.actor, Interpolate):
+            max_gaps[node.inputs["stream"]] = node.actor.max_gap_of
+    return slop, max_gaps.get("inclinometer"), max_gaps.get("odometry")

@@ -106,14 +106,18 @@ def test_only_pairs_and_tilts_within_tolerance_are_counted(tmp_path):
         for number, by in ((1, 6_000_000), (2, 4_000_000))
     ]
     path = write_sample(tmp_path / "log.mcap", *later, dropped(TILT, numbers=[1, 2, 3]))
-    frames = inventory_of(path)["frames"]
+    described = inventory_of(path)
+    frames = described["frames"]
     assert frames["pairs"] == FRAMES - 1
-    assert frames["with_tilt"] == 2  # the first and the last frame have a tilt at their stamp
+    assert frames["with_tilt"] == frames["pairs_with_tilt"] == 2  # the first and the last frame have one at their stamp
+    lost = "2 of 4 stereo pairs in a gap of the tilts, over 0.2 s long; a run loses the tilt there"
+    assert described["damage"] == [lost]
     wider = inventory_of(path, slop=6_000_000, max_gap=400_000_000)
     assert (wider["frames"]["pairs"], wider["frames"]["with_tilt"]) == (FRAMES, FRAMES)
     text = format_description(wider)
     assert "5 stereo pairs (stamps within 6 ms) from 5 left images and 5 right images; 5 left images with" in text
-    assert "readings at most 400 ms apart" in text
+    assert "readings at most 400 ms apart), 5 of them in pairs" in text
+    assert "damaged" not in text
 
 
 def test_repeated_stamps_count_once_and_are_reported(tmp_path):
