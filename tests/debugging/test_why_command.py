@@ -306,6 +306,12 @@ def test_a_frame_that_the_result_does_not_have_is_noted(traverse, first_frame):
     assert not why(out, 0.5, cell=(3, 0), log=traverse).notes
 
 
+def test_a_frame_in_the_messages_of_another_profile_is_not_noted_as_missing(traverse, tmp_path):
+    out = run_fast(tmp_path / "out.mcap", traverse, "--end", 0.8, "--profile", "foxglove")
+    found = why(out, 0.5, cell=(3, 0), log=traverse)
+    assert (found.notes, found.recorded) == ([], None)
+
+
 def test_a_frame_without_a_map_names_what_it_lost(traverse, tmp_path, refused):
     times = {"/imu/inclinometer": [row[3] for row in mcap_rows(traverse) if row[0] == "/imu/inclinometer"]}
 

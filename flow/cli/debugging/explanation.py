@@ -359,6 +359,8 @@ def _recorded(result: Path, stream: str, stamp: int, x: float, y: float) -> tupl
         return None if place is None else Cell(int(navigation.cells[place])), []
     with McapFile(result) as log:
         stamps = log.times(log.channels_of([topic])).tolist()
+    if stamp in stamps:  # another profile's message, which is not compared
+        return None, []
     those = f"; its maps are from {moment(stamps[0])} to {moment(stamps[-1])}" if stamps else ", nor at any other"
     return None, [f"note: the result has no '{stream}' at {moment(stamp)}{those}"]
 
