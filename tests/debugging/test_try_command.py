@@ -12,6 +12,7 @@ import stages
 from recordings.comparison.sweep import chart
 from recordings.comparison.text import moment
 from tests.conftest import FRAMES, SMALL, rewrite, run_fast
+from tests.flow.toys import PIPELINE
 
 AT = ("--at", "0.5", "-p", "fast")
 RIGHT = "/stereo/right/image_rect_color"
@@ -170,3 +171,10 @@ def test_a_change_without_effect_writes_no_recording(traverse, tmp_path, said):
 ])  # fmt: skip
 def test_what_cannot_be_tried_is_refused(traverse, tmp_path, refused, arguments, sentence):
     assert sentence in refused("try", traverse, *arguments, "-o", tmp_path / "try.rrd")
+
+
+def test_a_source_of_ones_own_is_refused_by_name(traverse, tmp_path, refused):
+    (tmp_path / "toy.yaml").write_text(PIPELINE % {"nap": 0, "bad": [], "fail_at": "null"})
+    sentence = "tests.flow.toys.Source is not recordings.McapSource; this command reads logs only through that source"
+    assert sentence in refused("try", traverse, "--at", 0.2, "-p", tmp_path / "toy.yaml", "--set", "twice.factor=3 m")
+    assert sentence in refused("info", traverse, "-p", tmp_path / "toy.yaml")

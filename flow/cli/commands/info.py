@@ -34,14 +34,13 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError(f"{options.write_pipeline} exists; choose another name or remove it")
     check_outputs({"pipeline": options.write_pipeline})
     from flow.cli.advice import pipeline_for, refusal_of
+    from flow.cli.debugging.result_input import check_source
     from flow.config.loader import load
-    from recordings import McapSource
     from recordings.inventory.description import describe
     from recordings.inventory.text import format_description
 
     graph = load(options.pipeline, options.set)
-    if not isinstance(graph.source, McapSource):
-        raise UsageError(f"{graph.source_use} is not recordings.McapSource; info reads logs only through that source")
+    check_source(graph)
     with graph.source.open(options.log) as log:
         description = describe(log, *_tolerances(graph)) | {"refused": refusal_of(graph, log)}
         if options.write_pipeline is not None:

@@ -55,6 +55,16 @@ def note_damage(result: Path) -> None:
             say(f"note: {result} is incomplete: {reason}")
 
 
+def check_source(graph: Graph) -> None:
+    """Raise UsageError for a graph with a source of the user's own, which opens only whole logs."""
+    from recordings import McapSource
+
+    if not isinstance(graph.source, McapSource):
+        raise UsageError(
+            f"{graph.source_use} is not recordings.McapSource; this command reads logs only through that source"
+        )
+
+
 @contextmanager
 def input_of(
     graph: Graph, result: Path, log: Path | str | Sequence[Path | str] | None = None
@@ -66,6 +76,7 @@ def input_of(
     from recordings.errors import LogError
     from recordings.scoring.result_log import about_run, input_beside
 
+    check_source(graph)
     named, given = about_run(result).get("log") or "which it does not name", input_beside(result)
     if log is not None:
         given = [Path(log)] if isinstance(log, Path | str) else [*map(Path, log)]

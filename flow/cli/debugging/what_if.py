@@ -9,7 +9,7 @@ from typing import Any
 
 from flow.cli.debugging.instants import Instant, Part, no_frame, part_of, run_from
 from flow.cli.debugging.logged_state import resume
-from flow.cli.debugging.result_input import graph_of, loss_at
+from flow.cli.debugging.result_input import check_source, graph_of, loss_at
 from flow.cli.debugging.variants import Variants, VariantSink, merged, sink_of
 from flow.cli.replay import ARROW_EXTRA, RESULT_TYPES, one_thread_per_call, product_version
 from flow.config.loader import load
@@ -72,6 +72,7 @@ def run_variants(
         label: load(pipeline, own) if isinstance(pipeline, str) else graph_of(pipeline, own, with_sinks=True)
         for label, own in changes.items()
     }
+    check_source(graphs["A"])
     beside = loading_kernels(RESULT_TYPES, "recordings.comparison.recording", ARROW_EXTRA)
     with beside, graphs["A"].source.open(logs) as log, one_thread_per_call():
         graphs = {label: fitted(graph, log) for label, graph in graphs.items()}
