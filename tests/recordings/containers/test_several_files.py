@@ -70,7 +70,8 @@ def test_a_missing_file_of_a_recording_is_in_the_ledger(sample, tmp_path):
     sentence = f"bag_1.mcap is missing in {folder}, although metadata.yaml lists it"
     *_, (_, stream, lost) = read(folder)
     assert (stream, str(lost)) == ("log", f"bag: {sentence}")
-    assert inventory_of(folder)["damage"] == [sentence]
+    gap = "1 of 3 stereo pairs in a gap of the tilts, over 0.2 s long; a run loses the tilt there"
+    assert inventory_of(folder)["damage"] == [sentence, gap]
 
 
 def test_damage_names_its_file(sample, tmp_path):
