@@ -47,7 +47,7 @@ class Loss:
 
     def as_dict(self) -> dict[str, str | int]:
         """The loss in plain JSON values."""
-        return {**asdict(self), "reason": str(self.reason)}
+        return {**asdict(self), "stamp": int(self.stamp), "reason": str(self.reason)}
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,10 @@
 import os
 import shutil
 import signal
+import sys
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -225,7 +227,8 @@ def test_what_a_kill_has_left_is_removed_with_the_checkpoint(log, stopped):
 
 
 @pytest.mark.parametrize("name", ["beside_resumed.py", "package_resumed/inner/part.py"])
-def test_a_changed_module_beside_the_pipeline_is_refused(log, tmp_path, name):
+def test_a_changed_module_beside_the_pipeline_is_refused(log, tmp_path, name, monkeypatch):
+    monkeypatch.setitem(sys.modules, "package_resumed", ModuleType("package_resumed"))  # is imported
     pipeline, module, out = tmp_path / "own.yaml", tmp_path / name, tmp_path / "nav.mcap"
     module.parent.mkdir(parents=True, exist_ok=True)
     (tmp_path / name).parent.parent.joinpath("__init__.py").touch()

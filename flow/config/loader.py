@@ -7,6 +7,7 @@ the dataclasses and annotations of the stages. An error names the file, the line
 from __future__ import annotations
 
 import fnmatch
+import os
 import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -100,10 +101,10 @@ def pipeline_file(name: str | Path, templates: bool = False) -> Path:
 
 
 def modules_beside(file: Path) -> list[Path]:
-    """The modules that a pipeline file of the user's own can name: .py files in its folder and in packages there."""
-    packages = {module.parent for module in file.parent.glob("*/*.py")}
-    own = [package for package in packages if package.name.isidentifier() and package.name not in OWN_PACKAGES]
-    return sorted([*file.parent.glob("*.py"), *(module for package in own for module in package.rglob("*.py"))])
+    """The modules in the folder of a loaded pipeline file, and those of packages there that were imported, sorted."""
+    imported = {name.partition(".")[0] for name in sys.modules.copy()} - OWN_PACKAGES
+    found = [*file.parent.glob("*.py"), *(module for name in imported for module in (file.parent / name).rglob("*.py"))]
+    return sorted(path for path in found if path.stem.isidentifier() and path.is_file() and os.access(path, os.R_OK))
 
 
 def shipped() -> list[str]:

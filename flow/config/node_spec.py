@@ -157,8 +157,10 @@ def _check_origin(top: str, place: YamlLocation) -> None:
     """Refuse a module, or one of a package, that is not the one beside the file: Python has one module of a name."""
     if place.folder is None or top in OWN_PACKAGES:
         return
-    for name in [name for name in sys.modules.copy() if name.partition(".")[0] == top]:
-        file = getattr(sys.modules[name], "__file__", None) or "Python's own"
+    for name, module in sys.modules.copy().items():
+        if name.partition(".")[0] != top:
+            continue
+        file = getattr(module, "__file__", None) or "Python's own"
         base = place.folder.joinpath(*name.split("."))
         for beside in (base.with_suffix(".py"), base / "__init__.py"):
             if beside.is_file() and not (Path(file).is_file() and filecmp.cmp(beside, file, shallow=False)):

@@ -359,12 +359,11 @@ class Engine:
             given = {port: frame.values[stream] for port, stream in node.inputs.items()}
             missing = missing_of(given.values())
             value = None if missing else node.actor(**given, **state)
-            flushed = value is None and flushes and self._ending and frame is self._frames[-1]
-            if flushed:
+            if value is None and flushes and self._ending and frame is self._frames[-1]:
                 value, frame.saved = node.actor.flush(**state), None  # its state is not that of a run that goes on
             if value is None and (missing or node.sparse):
                 return missing or Unchanged()
-            return node.checked(value, given.values(), frame.stamp, flushed)
+            return node.checked(value, given.values(), frame.stamp)
 
         large = bool(getattr(node.actor, "large", False))
         return Work(

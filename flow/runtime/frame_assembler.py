@@ -115,7 +115,7 @@ def valid_event(event: Any, source: str, streams: Collection[str], log_time: int
         return log_time, str(stream), StageError(f"{source} declares no stream {str(stream)!r}{meant}")
     if not isinstance(getattr(item, "stamp", None), Integral):
         return log_time, stream, StageError(f"{source} gave an item whose 'stamp' is not in whole ns")
-    return log_time, stream, frozen(item)
+    return log_time, stream, frozen(item, copies=not source.startswith("recordings."))
 
 
 def _checked(events: Iterable[Event], streams: set[str]) -> Iterator[_Message]:

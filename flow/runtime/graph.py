@@ -75,37 +75,44 @@ class Node:
         """Whether the actor is a stage that may return None, where a frame has nothing new."""
         return not self.aligns and NoneType in get_args(_returned(type(self.actor)))
 
-    def checked(self, value: Any, given: Iterable[Any], stamp: int | None, flushed: bool = False) -> Any:
+    def checked(self, value: Any, given: Iterable[Any], stamp: int | None) -> Any:
         """A result, read-only; refused if of another type, or with a stamp of neither the frame nor an input.
 
-        flushed: whether it is what the actor kept until the end, which may be older.
+        A stage that can flush may return what it has kept, with an earlier stamp.
         """
         if why := misfit(value, self.output):
             raise TypeError(f"{self.use} returned {why}")
-        stamps = {stamp, None, *(getattr(item, "stamp", None) for item in given)}
-        if getattr(value, "stamp", None) not in stamps and not flushed:
-            raise StageError(f"{self.use} returned the stamp {value.stamp} ns, not that of its frame")
-        return frozen(value)
+        stamps, own = {stamp, None, *(getattr(item, "stamp", None) for item in given)}, getattr(value, "stamp", None)
+        kept = own is not None and stamp is not None and own < stamp and hasattr(self.actor, "flush")
+        if own not in stamps and not kept:
+            raise StageError(f"{self.use} returned the stamp {own} ns, not that of its frame")
+        return frozen(value, copies=not type(self.actor).__module__.startswith("stages."))
 
 
-def frozen(value: Any) -> Any:
-    """An item that its maker cannot change under its readers: its arrays are read-only, a list or dict is a copy."""
+def frozen(value: Any, copies: bool) -> Any:
+    """An item with read-only arrays. A list, dict or tuple, and those in it, is another one.
+
+    copies: whether views are copied, as their maker may go on to write to the array that they are of.
+    """
     import numpy as np  # which help does not need
 
-    if type(value) is list:
-        return [frozen(part) for part in value]
-    if type(value) is dict:
-        return {key: frozen(part) for key, part in value.items()}
+    kind = type(value)
+    if kind in (list, tuple):
+        return kind([frozen(part, copies) for part in value])
+    if kind is dict:
+        return {key: frozen(part, copies) for key, part in value.items()}
     if isinstance(value, np.ndarray):
-        array: Any = value
-        while isinstance(array, np.ndarray):  # up to the owner of a view
-            array.flags.writeable, array = False, array.base
+        if copies and isinstance(value.base, np.ndarray) and value.base.flags.writeable:
+            value = value.copy()
+        value.flags.writeable = False
     elif isinstance(value, Mapping | tuple | list):
         for part in value.values() if isinstance(value, Mapping) else value:
-            frozen(part)
+            frozen(part, copies)
     elif is_dataclass(value):
         for one in fields(value):
-            frozen(getattr(value, one.name, None))
+            part = getattr(value, one.name, None)
+            if (fixed := frozen(part, copies)) is not part and isinstance(part, np.ndarray):
+                object.__setattr__(value, one.name, fixed)
     return value
 
 
@@ -292,9 +299,9 @@ def misfit(value: Any, kind: Any) -> str:
         fits = isinstance(value, Real if plain is float else plain)
     if not fits:
         return f"{type(value).__name__}, not {plain.__name__}"
-    if isinstance(value, tuple) and parts and parts[-1] is not Ellipsis and len(value) != len(parts):
+    if plain is tuple and parts and parts[-1] is not Ellipsis and len(value) != len(parts):
         return f"{counted(len(value), 'value')}, not {len(parts)}"
-    for name, item, wanted in _contents(value, parts):
+    for name, item, wanted in _contents(value, plain, parts):
         if why := misfit(item, wanted):
             return f"{why}, as {name!r}"
     return array_misfit(value.dtype.type, parts) if hasattr(value, "dtype") else ""
@@ -311,15 +318,15 @@ def array_misfit(given: type, parts: tuple[Any, ...]) -> str:
     return ""
 
 
-def _contents(value: Any, parts: tuple[Any, ...]) -> Iterator[tuple[Any, Any, Any]]:
-    """Name, item and annotated type of what is in a value; a field may be None. parts: the arguments of its type."""
+def _contents(value: Any, plain: type, parts: tuple[Any, ...]) -> Iterator[tuple[Any, Any, Any]]:
+    """Name, item and annotated type of what is in a value; a field may be None. plain, parts: its type, taken apart."""
     if is_dataclass(value) and not type(value).__module__.startswith("stages."):  # a user's own
         fields = ((name, getattr(value, name), kind) for name, kind in hints_of(type(value)).items())
         yield from (field for field in fields if field[1] is not None)
     elif isinstance(value, Mapping) and parts:
         yield from ((name, item, parts[1]) for name, item in value.items())
-    elif isinstance(value, list | tuple) and parts:
-        kinds = repeat(parts[0]) if isinstance(value, list) or parts[-1] is Ellipsis else parts
+    elif type(value) in (list, tuple) and parts:
+        kinds = parts if plain is tuple and parts[-1] is not Ellipsis else repeat(parts[0])
         yield from ((number, item, kind) for number, (item, kind) in enumerate(zip(value, kinds, strict=False)))
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, cast
 
@@ -167,9 +168,9 @@ def run(
     SinkError
         An output could not be written. All outputs are closed by then.
     """
-    if not isinstance(workers, int) or not 1 <= workers <= MAX_WORKERS:
+    if not isinstance(workers, Integral) or not 1 <= workers <= MAX_WORKERS:
         raise UsageError(f"a run needs 1 to {MAX_WORKERS} workers, not {workers!r}")
-    if rate is not None and not 0 < rate < math.inf:
+    if rate is not None and not (isinstance(rate, Real) and 0 < rate < math.inf):
         raise UsageError(f"the rate of a run must be above 0, not {rate!r}")
     graph = with_spare_threads(asked(fitted(graph, log), outputs), log.frames, workers)
     every = every if isinstance(every, Every) else Every(1 if every is None else every)

@@ -145,9 +145,8 @@ def _points(one: Any, other: Any) -> Measures:
     if not (len(first) and len(second)):
         return found
     apart = np.concatenate([KDTree(second).query(first)[0], KDTree(first).query(second)[0]])
-    moved = 100 * apart[apart > 0]
-    sizes = {"median": np.median(moved), "largest": np.max(moved)} if moved.size else {}
-    return found | {f"{name} distance to the nearest point cm": float(value) for name, value in sizes.items()}
+    sizes = {"median": 100 * np.median(apart), "largest": 100 * np.max(apart)}
+    return found | {f"{name} distance to the nearest point cm": float(size) for name, size in sizes.items()}
 
 
 def _places(message: Any) -> Array:

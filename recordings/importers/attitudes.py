@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def read_attitudes(
     placed: dict[int, tuple[ImagePair, Transform | None]] = {}
     for where, values in _rows(path):
         name = values.pop("name", values.get("stamp", ""))
-        numbers = named.get(name, [])
+        numbers = named.get(PurePath(name).as_posix().lstrip("/"), [])
         if not numbers:
             others.append(name)
             continue

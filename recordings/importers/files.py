@@ -45,7 +45,7 @@ def read_lines(path: Path, listed: bool = False) -> Iterator[tuple[str, str]]:
         if (content := line.strip()) and content[0] not in "#%":
             if listed and gap:
                 raise LogError(
-                    f"{path}, line {gap} has no content, but lines are counted as images are; fill or remove it"
+                    f"{path}, line {gap} is empty or a comment, but lines are counted as images are; fill or remove it"
                 )
             begun = True
             yield f"{path}, line {number}", content
@@ -66,8 +66,11 @@ def read_rows(
 
 def firsts(rows: Iterable[tuple[Any, Any]], what: str, where: str, notes: list[str]) -> dict[Any, Any]:
     """Key -> value of rows, the first one of each key. A note counts the others. what: the keys in words."""
-    found: dict[Any, Any] = {}
-    repeated = [key for key, value in rows if found.setdefault(key, value) is not value]
+    found, repeated = dict[Any, Any](), []
+    for key, value in rows:
+        if key in found:
+            repeated.append(key)
+        found.setdefault(key, value)
     if repeated:
         rest = counted(len(repeated), "row")
         notes.append(f"{where} has {rest} whose {what} is in a row before, first: {repeated[0]}; left out")

@@ -122,7 +122,7 @@ def import_images(
         pairs = counted(len(left), "pair")
         raise LogError(f"the rate of {pairs} must be above 0 and at most 1e9 Hz, not {rate:g}; stamps end in 2038")
     if attitudes is not None and roll:
-        raise LogError(f"{attitudes} is in place of a roll of {roll:g} degrees; give its rows the column 'roll'")
+        raise LogError(f"a roll of {roll:g} degrees cannot be combined with {attitudes}; add a column 'roll' to it")
     if not abs(pitch_down) <= 90 or not abs(roll) <= 180:
         raise LogError(
             f"a pitch of {pitch_down} and a roll of {roll} degrees are impossible; give at most 90 and 180 degrees"

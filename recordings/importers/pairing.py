@@ -15,8 +15,8 @@ SUFFIXES = {".png", ".jpg", ".jpeg", ".ppm", ".pgm", ".tif", ".tiff", ".bmp"}
 # Ground truth beside the images of data sets, such as Middlebury's mask0nocc.png.
 _TRUTHS = ("mask", "disp", "disparity", "depth", "truth", "gt")
 _NOT_CAMERAS = re.compile(f"(^|[^a-z])({'|'.join(_TRUTHS)})([^a-z]|$)", re.IGNORECASE)
-# Names that differ only in these words and in numbers are of several cameras.
-_CAMERA_WORD = re.compile("front|rear|back|rect(ified)?|raw|gr[ae]y|colou?r|mono|rgb|(nav|haz|pan|loc)(cam)?")
+# Names that differ only in these words are images of one moment by several cameras.
+_CAMERA_WORD = re.compile(r"[-_. ]?(?<![a-z])(front|rear|rect(ified)?|raw|(nav|haz)(cam)?)(?![a-z])", re.IGNORECASE)
 _MAX_LISTED = 5  # files in a sentence
 _CAMERA = "|".join(f"(?<={word}{dash})" for word in ("cam", "camera", "im", "img", "image") for dash in ("", "_"))
 _RIGHT = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "l": "r", "L": "R"}
@@ -75,17 +75,16 @@ def _check_cameras(folder: Path, names: list[str], word: re.Pattern[str], notes:
         raise LogError(
             f"{folder} contains pairs of several cameras ({', '.join(folders)}); give the folder of one camera"
         )
-    kinds: dict[tuple[str, ...], tuple[set[str], str]] = {}  # other words -> those for a camera, and the first name
+    moments, kinds = dict[str, str](), dict[str, str]()  # name without words for a camera, or without digits -> first
     for name in names:
-        words = re.findall("[a-z]+", word.sub("-", name.rpartition(".")[0]).lower())
-        cameras = {each for each in words if _CAMERA_WORD.fullmatch(each)}
-        first = kinds.setdefault(tuple(each for each in words if each not in cameras), (cameras, name))
-        if first[0] != cameras:
-            raise LogError(
-                f"{folder} contains pairs of several cameras ({first[1]}, {name}); give a folder with those of one"
-            )
+        stem = name.rpartition(".")[0]
+        first = moments.setdefault(_CAMERA_WORD.sub("", stem).strip("-_. "), name)
+        if first != name:
+            both = f"{first}, {name}"
+            raise LogError(f"{folder} contains pairs of several cameras ({both}); give a folder with those of one")
+        kinds.setdefault(re.sub(r"[\W\d_]+", " ", word.sub(" ", stem)).strip(), name)
     if len(kinds) > 1:
-        some = ", ".join(name for _, name in list(kinds.values())[:2])
+        some = ", ".join(list(kinds.values())[:2])
         notes.append(f"all pairs are taken as those of one camera, with {len(kinds)} kinds of names, such as {some}")
 
 

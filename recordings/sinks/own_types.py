@@ -66,12 +66,16 @@ def _number(value: Any, kind: Any) -> bool | int | float:
 
 
 def _array(value: Any, kind: Any) -> Any:
-    """A list or tuple as an array of floats where one is annotated, else of what it contains; an empty one of ints."""
+    """A list or tuple as an array: of the annotated numbers if they are floats or there are none, else as it comes."""
     array = np.asarray(value)
-    items = [item for option in _options(kind) for item in get_args(option) if isinstance(item, type)]
-    if array.dtype.kind in "biuf" and items:
-        is_float = any(issubclass(item, float | np.floating) for item in items)
-        return array.astype(np.float64 if is_float else np.int64 if not array.size else array.dtype, copy=False)
+    items = [item for option in _options(kind) for item in get_args(option) if item is not Ellipsis]
+    if (
+        array.dtype.kind in "biuf"
+        and items
+        and all(isinstance(item, type) and issubclass(item, NUMBERS) for item in items)
+    ):
+        annotated = np.result_type(*items)
+        return array.astype(annotated if annotated.kind == "f" or not array.size else array.dtype, copy=False)
     return array
 
 

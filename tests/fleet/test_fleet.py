@@ -159,7 +159,14 @@ def test_a_pipeline_takes_the_packages_beside_it_along(tmp_path, monkeypatch):
     stage, own = tmp_path / "here/travelling/inner/stage.py", tmp_path / "here/own.yaml"
     stage.write_text("from stages import Rectify\n")
     own.write_text(TRAPPED.replace("trap.Trap", "travelling.inner.stage.Rectify"))
+    (tmp_path / "here/unused").mkdir()
+    for folder in ("unused", "travelling"):
+        os.mkfifo(tmp_path / f"here/{folder}/pipe.py")
+        (tmp_path / f"here/{folder}/.#edit.py").symlink_to("nowhere")
+    (tmp_path / "here/unused/script.py").touch()
     pipeline = Pipeline.of(str(own), ())
+    names = {"own.yaml", *(f"travelling/{name}.py" for name in ("__init__", "inner/__init__", "inner/stage"))}
+    assert pipeline.files.keys() == names
     copy = Path(pipeline.local())
     assert (copy.parent / "travelling/inner/stage.py").read_bytes() == stage.read_bytes()
     stage.write_text("from stages import Rectify  # and more\n")

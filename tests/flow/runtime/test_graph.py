@@ -1,6 +1,6 @@
 """What a stage returns is what its annotation says."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from tests.flow.toys import Couple
     (np.zeros(2, bool), NDArray[np.uint8], "an array of bool, not of uint8"),
     ({"a": np.zeros(2)}, Mapping[str, NDArray[np.int64]], "an array of float64, not of int64, as 'a'"),
     ((1.0, 2, 3), tuple[float, int], "3 values, not 2"), ((1.0,), tuple[float, int], "1 value, not 2"),
+    ((1.0, 2.0, 3.0), Sequence[float], ""), ((1.0, "x"), Sequence[float], "str, not float, as 1"),
     (np.zeros(2), NDArray[np.float32], ""), (np.float32(1), float, ""), ((1, "x"), tuple[int, str], ""),
     ({"a": 3}, Mapping[str, float | None], ""), (np.zeros(2), NDArray[Any], ""), ({"a": object()}, dict[str, Any], ""),
 ])  # fmt: skip

@@ -1,5 +1,6 @@
 """A run ends with a correct verdict and ledger, despite missing streams, failures and interrupts."""
 
+import json
 import re
 import signal
 import subprocess
@@ -7,10 +8,11 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flow.errors import SinkError, UsageError
@@ -120,6 +122,12 @@ def test_a_log_that_fails_midway_keeps_the_frames_read_before(tmp_path):
 def test_a_mistake_in_a_source_is_named_with_its_line(tmp_path):
     _, summary = replayed_log(graph(tmp_path), EndsWith(KeyError("left"), traverse(5)))
     assert "KeyError: 'left' (test_run.py, line" in summary["ledger"][0]["detail"]
+
+
+def test_stamps_may_be_numbers_of_numpy(tmp_path):
+    events = [(np.int64(at), stream, replace(item, stamp=np.int64(item.stamp))) for at, stream, item in traverse(3)]
+    _, summary = replayed(graph(tmp_path, bad=[1.0]), events, workers=np.int64(2))
+    assert json.loads(json.dumps(summary["ledger"]))[0]["stamp"] == 100 * MS
 
 
 def test_a_run_without_a_frame_is_not_complete(tmp_path):

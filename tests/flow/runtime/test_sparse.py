@@ -51,6 +51,20 @@ class Dense(EachFourth):
 
 
 @dataclass(frozen=True)
+class Lagging(EachFourth):
+    """Returns the item of the frame before."""
+
+    def __call__(self, couple: Couple, *, state: list[Couple]) -> Couple | None:
+        """See above."""
+        state.append(couple)
+        return state[-2] if len(state) > 1 else None
+
+    def flush(self, state: list[Couple]) -> Couple | None:
+        """The last item."""
+        return None
+
+
+@dataclass(frozen=True)
 class Stale(EachFourth):
     """Returns the stamp of another frame."""
 
@@ -88,7 +102,10 @@ def test_frames_without_anything_new_are_whole(tmp_path, workers, frames, due):
         assert record.unchanged == (frozenset() if record.index in due else {"fourth", "next"})
 
 
-def test_only_a_flush_may_have_another_stamp_than_the_frame(tmp_path):
+def test_a_stage_that_can_flush_may_return_only_earlier_stamps(tmp_path):
+    sink, summary = replayed(graph(tmp_path, text=PIPELINE.replace("EachFourth", "Lagging")), traverse(4))
+    assert [record.items["fourth"].stamp for record in sink.records[1:]] == [0, 100 * MS, 200 * MS]
+    assert summary["verdict"] == "COMPLETE"
     _, summary = replayed(graph(tmp_path, text=PIPELINE.replace("EachFourth", "Stale")), traverse(3))
     assert summary["drops"] == {"failed": 3}
     assert "Stale returned the stamp 1 ns, not that of its frame" in summary["ledger"][0]["detail"]

@@ -166,9 +166,15 @@ def test_a_list_or_dict_that_a_stage_returns_is_a_copy(tmp_path):
     assert [len(record.items["total"]["frames"]) for record in sink.records] == [1, 2, 3, 4, 5]
 
 
-@pytest.mark.parametrize("stage", ["Sums", "Views"])
-def test_a_stage_cannot_change_an_array_that_it_has_returned(tmp_path, stage):
-    text = TOYS.replace("tests.flow.toys.Total", f"tests.flow.runtime.test_state.{stage}")
+def test_a_view_of_a_state_that_a_stage_returns_is_a_copy(tmp_path):
+    text = PIPELINE.replace("tests.flow.toys.Total", "tests.flow.runtime.test_state.Views")
+    sink, summary = replayed(graph(tmp_path, text=text), numbers(5), workers=4)
+    assert [float(record.items["total"][0]) for record in sink.records] == [0, 2, 6, 12, 20]
+    assert summary["verdict"] == "COMPLETE"
+
+
+def test_a_stage_cannot_change_an_array_that_it_has_returned(tmp_path):
+    text = TOYS.replace("tests.flow.toys.Total", "tests.flow.runtime.test_state.Sums")
     pipeline = graph(tmp_path, text=text)
     ((use, _),) = pipeline.sinks
     summary = run(pipeline, Log(numbers(3)), {use: tmp_path / "out.txt"})

@@ -110,8 +110,8 @@ def test_pairs_are_found_by_name_in_order(tmp_path, names, left):
     (["0.png", "1.png", "2.png", "3.png"], r"contains no image pairs, only 4 images"),
     (["0/0.png", "0/1.png", "1/0.png", "1/1.png"], r"contains no image pairs, only 4 images"),
     (["left/1.png", "right/1.png", "left_raw/1.png", "right_raw/1.png"], r"several cameras \(left, left_raw\)"),
-    (["front_left_1.png", "front_right_1.png", "rear_left_2.png", "rear_right_2.png"],
-     r"several cameras \(front_left_1\.png, rear_left_2\.png\); give a folder with those of one"),
+    (["front_left_1.png", "front_right_1.png", "rear_left_1.png", "rear_right_1.png"],
+     r"several cameras \(front_left_1\.png, rear_left_1\.png\); give a folder with those of one"),
     (["left_1.png", "right_1.png", "left_1_rect.png", "right_1_rect.png"], "several cameras"),
     (["front/left_1.png", "front/right_1.png", "rear/left_1.png", "rear/right_1.png"], "several cameras"),
     (["left/data/1.png", "right/data/1.png"], r"only 0 images in it and its folders \(deeper ones are not searched\)"),
@@ -123,6 +123,17 @@ def test_no_image_is_left_out_silently(tmp_path, names, sentence):
         save(tmp_path / name, picture(0))
     with pytest.raises(LogError, match=sentence):
         pair_images(tmp_path, [])
+
+
+@pytest.mark.parametrize("stems", [
+    ["drive_01_%s", "drive_back_01_%s"], ["rock-%s", "gray-rock-%s"], ["%s_A", "%s_a"], ["é_%s", "è_%s"],
+    ["site_front_%s", "site_back_%s"], ["pan_10_%s", "10_%s"], ["front_%s_1", "rear_%s_2"], ["%s/2", "%s/color1"],
+])  # fmt: skip
+def test_names_of_one_camera_may_have_any_words(tmp_path, stems):
+    for stem in stems:
+        for side in SIDES:
+            save(tmp_path / f"{stem % side}.png", picture(0))
+    assert len(pair_images(tmp_path, [])[0]) == 2
 
 
 def test_images_that_are_left_out_or_may_be_of_several_cameras_are_noted(tmp_path):
@@ -375,5 +386,5 @@ def test_a_row_of_attitudes_names_one_image_by_its_folder_where_names_repeat(tmp
 
 def test_a_roll_beside_a_file_of_attitudes_is_refused(tmp_path):
     (attitudes := tmp_path / "attitudes.csv").write_text("name,pitch_down\n0-left,14\n")
-    with pytest.raises(LogError, match="is in place of a roll of 30 degrees; give its rows the column 'roll'"):
+    with pytest.raises(LogError, match=r"a roll of 30 degrees cannot be combined with .*; add a column 'roll' to it"):
         imported(tmp_path, make_pairs(tmp_path, 1), attitudes=attitudes, roll=30)
