@@ -36,17 +36,18 @@ CASES = {
         "sequence", "sequences/05/times.txt", lambda content: b"1e999999\n" + content, "not seconds"),
     "an empty line among times": (
         "sequence", "sequences/05/times.txt", lambda content: content.replace(b"\n", b"\n\n", 1),
-        "times.txt, line 2 has no content, but lines are counted as images are"),
+        "times.txt, line 2 is empty or a comment, but lines are counted as images are"),
     "an empty line among poses": (
-        "sequence", "poses/05.txt", lambda content: b"# poses\n\n" + content, "05.txt, line 2 has no content"),
+        "sequence", "poses/05.txt", lambda content: b"# poses\n\n" + content, "05.txt, line 2 is empty or a comment"),
     "a comment among dates": (
         "drive", "2011_09_26_drive_0001_sync/image_00/timestamps.txt",
-        lambda content: content.replace(b"\n", b"\n# lost\n", 1), "timestamps.txt, line 2 has no content"),
+        lambda content: content.replace(b"\n", b"\n# lost\n", 1), "timestamps.txt, line 2 is empty or a comment"),
     "an empty line among dates of the Imu": (
         "drive", "2011_09_26_drive_0001_sync/oxts/timestamps.txt", lambda content: b"\n" + content,
-        "timestamps.txt, line 1 has no content"),
+        "timestamps.txt, line 1 is empty or a comment"),
     "an empty line among poses of TartanAir": (
-        "tartanair", "P0/pose_left.txt", lambda content: content.replace(b"\n", b"\n \n", 1), "line 2 has no content"),
+        "tartanair", "P0/pose_left.txt", lambda content: content.replace(b"\n", b"\n \n", 1),
+        "line 2 is empty or a comment"),
     "a stamp of thousands of digits": (
         "euroc", "room/mav0/imu0/data.csv", lambda content: content.replace(b"\n17", b"\n" + b"17" * 2500, 1),
         "not between 1970 and 2038"),
