@@ -16,7 +16,7 @@ MAX_FILE_BYTES = 1_000_000
 
 
 class _RepeatedKey(yaml.MarkedYAMLError):
-    """A mapping has a key twice, of which PyYAML takes the last one."""
+    """A mapping repeats a key. PyYAML alone would take the last one."""
 
 
 class _Loader(yaml.SafeLoader):
