@@ -506,9 +506,13 @@ def test_a_failing_close_says_what_the_other_output_contains(tmp_path, monkeypat
         run(pipeline, Log(traverse(3)), {"tests.flow.toys.Kept": Path("a")})
 
 
-@pytest.mark.parametrize("options", [{"workers": 1.5}, {"rate": 0}, {"rate": float("nan")}, {"every": 0}])
-def test_an_argument_that_is_out_of_range_is_refused(tmp_path, options):
-    with pytest.raises((UsageError, ValueError), match=r"workers, not 1\.5|must be (above 0|at least 1)"):
+@pytest.mark.parametrize(("options", "sentence"), [
+    ({"workers": 1.5}, r"a run needs 1 to 1024 workers, not 1\.5"), ({"rate": 0}, "the rate of a run must be above 0"),
+    ({"rate": float("nan")}, "the rate of a run must be above 0, not nan"),
+    ({"rate": "1"}, "the rate of a run must be above 0, not '1'"), ({"every": 0}, "Every.frames must be at least 1"),
+])  # fmt: skip
+def test_an_argument_that_is_out_of_range_is_refused(tmp_path, options, sentence):
+    with pytest.raises((UsageError, ValueError), match=sentence):
         replayed(graph(tmp_path), traverse(3), **options)
 
 
