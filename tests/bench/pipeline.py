@@ -9,6 +9,7 @@ medians of the rounds. Compiled kernels come from the cache, which a first short
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import resource
@@ -36,16 +37,21 @@ BEFORE = ("rectified", "disparity")  # the stages up to the disparity
 SINKS = ("recordings.McapSink", "recordings.RerunSink")
 
 
-def main() -> None:
-    """Print a table for each image size."""
+def main(arguments: list[str] | None = None) -> None:
+    """Print a table for each image size and pipeline."""
+    parser = argparse.ArgumentParser("python -m tests.bench.pipeline", description=__doc__)
+    parser.add_argument("--size", nargs="+", choices=SIZES, default=list(SIZES), help="sizes of the images (all)")
+    parser.add_argument("--pipelines", nargs="+", choices=PIPELINES["1280x960"], help="pipelines (those of the size)")
+    options = parser.parse_args(arguments)
     cores = len(os.sched_getaffinity(0))
     print(f"{LONG} simulated frames of scene mixed, {cores} workers, result log and recording written")
     with tempfile.TemporaryDirectory() as folder:
-        for size, disparities in SIZES.items():
+        for size in options.size:
+            disparities = SIZES[size]
             log = Path(folder) / f"{size}.mcap"
             _roverflow("simulate", log, "--frames", LONG, "--size", size)
             match = _opencv(log, disparities)
-            for pipeline in PIPELINES[size]:
+            for pipeline in options.pipelines or PIPELINES[size]:
                 short, long, rounds = PAPER if pipeline == "paper" else (SHORT, LONG, ROUNDS)
                 bench = [_round(log, pipeline, disparities, cores, (short, long), match) for _ in range(rounds + 1)]
                 _print(f"{pipeline}, {size}, {disparities} disparities", bench[1:])  # the first one fills the cache
