@@ -136,7 +136,7 @@ def test_a_right_image_that_is_missing_is_not_counted_as_a_frame(traverse, tmp_p
     words = ("-p", "fast", *SMALL, "-o", tmp_path / "b.rrd")
     output = said(0, "try", log, "--at", "0.5", "--frames", 3, *words).out
     assert "2 frames from 0.513 s on: " in output
-    command = rf"roverflow run {re.escape(str(log))} --start \d\.\d+( --end \d\.\d+)? -o OTHER\.mcap says why\n"
+    command = rf"roverflow run {re.escape(str(log))} -p fast --start \d\.\d+( --end \d\.\d+)? -o OTHER\.mcap says why\n"
     assert re.search(rf"\nnote: 1 frame gave no result; {command}", output)
     why = refused("try", log, "--at", "1.05", *words)
     assert re.search(rf"no frame was completed at 1\.013 s: left unmatched; {command}", why)

@@ -89,18 +89,24 @@ def edges_of(log: McapLog, times: NDArray[np.int64]) -> list[float]:
     return [(edge - log.begin) / 1e9 for edge in edges.tolist()]  # stamps may precede the log's first message
 
 
-def no_frame(part: Part, loss: FrameLoss | None, log: McapLog) -> UsageError:
-    """The error for a part whose run gave no frame. loss: at its stamp."""
+def no_frame(part: Part, loss: FrameLoss | None, log: McapLog, pipeline: str | Path = "rover") -> UsageError:
+    """The error for a part whose run gave no frame. loss: at its stamp; pipeline: as for `run_from`."""
     why = "" if loss is None else f": {loss.words}"
-    remedy = "" if loss is not None and loss.detail else f"; {run_from(log, part)} says why"
+    remedy = "" if loss is not None and loss.detail else f"; {run_from(log, part, pipeline=pipeline)} says why"
     return UsageError(f"no frame was completed at {part.at:.3f} s{why}{remedy}")
 
 
-def run_from(log: McapLog, part: Part, end: float | None = None) -> str:
-    """The command that runs a log from the instant on. end: s after the log's first message."""
+def run_from(log: McapLog, part: Part, end: float | None = None, *, pipeline: str | Path) -> str:
+    """The command that runs a log from the instant on.
+
+    end: s after the log's first message; pipeline: its name or file; a path is that of a result log, which `run` does
+    not take.
+    """
     files = [log.given] if isinstance(log.given, Path | str) else log.given
     until = "" if end is None else f" --end {end:.3f}"
-    return f"roverflow run {shlex.join(map(str, files))} --start {max(0, part.first):.3f}{until} -o OTHER.mcap"
+    named = [] if isinstance(pipeline, Path) or pipeline == "rover" else ["-p", pipeline]
+    what = shlex.join([*map(str, files), *named])
+    return f"roverflow run {what} --start {max(0, part.first):.3f}{until} -o OTHER.mcap"
 
 
 def _outside(log: McapLog, times: NDArray[np.int64], at: Instant) -> str:

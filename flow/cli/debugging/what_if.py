@@ -97,7 +97,7 @@ def run_variants(
     through = stamps_of(paths["A"], results=True).size if all(path.exists() for path in paths.values()) else 0
     if not through:
         whole = pipeline if isinstance(pipeline, Path) else None
-        raise no_frame(part, loss_at(part.stamp, summary["ledger"], whole), log)
+        raise no_frame(part, loss_at(part.stamp, summary["ledger"], whole), log, pipeline)
     for label, names in variants.names.items():
         lost = [one for one in summary["ledger"] if one["stage"] in names.values() and one["stamp"] >= part.stamp]
         if lost:
@@ -105,7 +105,7 @@ def run_variants(
             notes.append(f"note: {label} lost {frames_lost}, first in {lost[0]['stage']}: {lost[0]['detail']}")
     if through < part.frames:
         without = counted(part.frames - through, "frame")
-        notes.append(f"note: {without} gave no result; {run_from(log, part, part.end)} says why")
+        notes.append(f"note: {without} gave no result; {run_from(log, part, part.end, pipeline=pipeline)} says why")
     return paths, variants, replace(part, frames=through), notes
 
 
