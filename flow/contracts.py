@@ -25,6 +25,7 @@ class LossReason(StrEnum):
     UNALIGNED = "unaligned"  # no sample of another clock's stream for the frame
     DROPPED = "dropped"  # the workers were busy until the next frame was due (run --rate)
     FAILED = "failed"  # a stage raised an exception
+    UNWRITABLE = "unwritable"  # a sink has no form for a value
     ABANDONED = "abandoned"  # the run ended before the frame was finished
 
 
@@ -194,8 +195,8 @@ class Sink(Protocol):
     def open(self, path: Any, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Begin an output. No file with the name `path` appears before `close`."""
 
-    def write(self, record: Any) -> None:
-        """Write one FrameRecord."""
+    def write(self, record: Any) -> Mapping[str, str] | None:
+        """Write one FrameRecord. May return the streams that it has no form for in this frame -> why, as losses."""
 
     def close(self, summary: Mapping[str, Any]) -> None:
         """Finish the output and give it its name."""

@@ -78,7 +78,8 @@ def report(summary: dict[str, Any], compiled: bool = False) -> None:
     for reason, _ in by_cause(summary["drops"]):
         begin = summary.get("log_begin" if reason == LossReason.UNREADABLE else "first_stamp")  # log times, stamps
         lost = [entry for entry in summary["ledger"] if entry["reason"] == reason]
-        by_stage = [entry["stage"] if reason == LossReason.FAILED else "" for entry in lost]
+        named = reason in (LossReason.FAILED, LossReason.UNWRITABLE)
+        by_stage = [entry["stage"] if named else "" for entry in lost]
         for stage in dict.fromkeys(by_stage):
             first = lost[by_stage.index(stage)]
             place = f"{first['stream']} at {_moment(first['stamp'], begin)}"

@@ -286,6 +286,8 @@ class Engine:
             value = Absent(entry)
         if work.output:
             frame.values[work.output] = value
+        for stream, why in value.items() if work.output is None and isinstance(value, Mapping) else ():
+            self._ledger.add(Loss(stream, frame.stamp, work.name, LossReason.UNWRITABLE, why))
         self._complete(work, frame)
         if isinstance(value, NO_ITEM):
             self._pass_absence(frame)
@@ -374,7 +376,7 @@ class Engine:
         stages = [work for work in self._work if work.output]
         order = {work.name: index for index, work in enumerate(self._work)}
 
-        def run(frame: Frame) -> None:
+        def run(frame: Frame) -> Mapping[str, str] | None:
             values = {stream: frame.values[stream] for stream in streams}
             items = {stream: value for stream, value in values.items() if not isinstance(value, NO_ITEM)}
             unchanged = frozenset(stream for stream, value in values.items() if isinstance(value, Unchanged))
@@ -382,7 +384,7 @@ class Engine:
             with self._condition:
                 seconds = frame.seconds | self._sink_seconds
                 queues = {work.name: len(work.inbox) for work in stages}
-            sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues, unchanged))
+            return sink.write(FrameRecord(frame.index, frame.stamp, items, entries, seconds, queues, unchanged))
 
         # A sink waits for every stream of the frame, even those it does not get: only then are the entries complete.
         every = tuple(dict.fromkeys([*streams, *(work.name for work in stages)]))

@@ -16,7 +16,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, cast
 
-from flow.contracts import MAX_WORKERS, Event, Finding, Log, Sink, StageError, Verdict, nearest
+from flow.contracts import MAX_WORKERS, Event, Finding, Log, LossReason, Sink, StageError, Verdict, nearest
 from flow.errors import PipelineError, SinkError, UsageError
 from flow.runtime.bottleneck import latency, usable_cores
 from flow.runtime.checkpoint import Checkpoint, Checkpoints, check_resumable
@@ -355,6 +355,7 @@ def _peak_memory_mb() -> float:
 
 def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: dict[str, float]) -> dict[str, Any]:
     """The counts and times of the summary. start_seconds is the part of wall_seconds before the first frame."""
+    unwritable = (entry for entry in ledger.entries if entry.reason == LossReason.UNWRITABLE)
     return {
         "frames_in": engine.admitted,
         "frames_out": engine.complete,
@@ -371,5 +372,5 @@ def _counts(assembler: FrameAssembler, engine: Engine, ledger: Ledger, times: di
         "frames_per_second": round((engine.through - engine.resumed) / times["wall_seconds"], 4),
         "peak_memory_mb": _peak_memory_mb(),
         "ledger": [entry.as_dict() for entry in ledger.entries],
-        "entries": [*engine.late_entries, *assembler.late_entries],
+        "entries": [*engine.late_entries, *assembler.late_entries, *unwritable],
     }

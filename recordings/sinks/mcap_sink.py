@@ -15,7 +15,6 @@ from typing import Any, ClassVar
 
 from flow.contracts import FrameRecord, Loss
 from flow.parameters import check_parameters, parameter, set_by_run
-from recordings.errors import LogError
 from recordings.mcap.input_copy import copy_inputs, parents_in
 from recordings.mcap.writer import COMPRESSIONS, Ros2Writer, Written
 from recordings.ros2.plain import message_of
@@ -110,7 +109,7 @@ class McapSink:
     names_streams: ClassVar[tuple[str, ...]] = ("results", "also")
     _writer: Ros2Writer = field(init=False, repr=False)
     _kinds: Mapping[str, Any] = field(default_factory=dict, init=False, repr=False)
-    _owners: dict[str, tuple[str, ...]] = field(default_factory=dict, init=False, repr=False)
+    _owners: dict[str, str] = field(default_factory=dict, init=False, repr=False)
     _about: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)
     _theirs: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)  # frame -> parent in the input
     _rooted: bool = field(default=False, init=False, repr=False)
@@ -152,11 +151,11 @@ class McapSink:
             self._writer.abort()
             raise
 
-    def write(self, record: FrameRecord) -> None:
-        """Write a frame."""
+    def write(self, record: FrameRecord) -> dict[str, str]:
+        """Write a frame. Returns why streams, or parts of them, have no message in it."""
         writer, stamp = self._writer, record.stamp
         kept = {name: record.items[name] for name in self._written if name in record.items}
-        self._write_items(kept, stamp)
+        lost = self._write_items(kept, stamp)
         own = {(known.parent, known.child): known for known in _transforms(record.items.values(), stamp)}
         regional = any(plain_type(kind) is Region for kind in self._kinds.values())
         if transforms := beside_inputs([*own.values()], self._theirs, regional):
@@ -178,6 +177,7 @@ class McapSink:
         writer.write("/nav/diagnostics", diagnostics(stamp, statuses), stamp)
         writer.flush()  # so that a resumed log has the same bytes
         self._last_stamp = stamp
+        return lost
 
     def checkpoint(self) -> tuple[Written, dict[str, Any]]:
         """What the log contains by now, and what the sink remembers of it."""
@@ -235,27 +235,31 @@ class McapSink:
     def _written(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys((*self.results, *self.also)))
 
-    def _write_items(self, items: Mapping[str, Any], stamp: int) -> None:
-        """Write streams of a frame."""
+    def _write_items(self, items: Mapping[str, Any], stamp: int) -> dict[str, str]:
+        """Write streams of a frame; returns the parts without a message -> why."""
+        lost = dict[str, str]()
         for stream, item in cropped(items).items():
-            for topic, message in self._messages(stream, item, stamp):
-                self.empty = False
-                self._writer.write(topic, message, stamp)
-
-    def _messages(self, stream: str, item: Any, stamp: int) -> Iterator[tuple[str, Any]]:
-        """Topic and message of each part of an item."""
-        for path, leaf in leaves(item, self._kinds.get(stream, type(item)), _KNOWN):
-            topic = "/".join(["/nav", stream, *map(_topic_part, path)])
             try:
-                found = self._built(leaf, stamp, str(getattr(item, "frame_id", "")))
+                parts = [*leaves(item, self._kinds.get(stream, type(item)), _KNOWN)]
             except ValueError as error:
-                raise LogError(f"McapSink cannot write '{'/'.join((stream, *path))}': {error}") from error
-            for below, message in found.items():
-                owner = self._owners.setdefault(topic + below, (stream, *path))
-                if owner != (stream, *path):
-                    one, other = ("/".join(names) for names in (owner, (stream, *path)))
-                    raise LogError(f"McapSink cannot write both '{one}' and '{other}' to {topic + below}; rename one")
-                yield topic + below, message
+                parts, lost[stream] = [], str(error)
+            for path, leaf in parts:
+                name = "/".join((stream, *path))
+                topic = "/".join(["/nav", stream, *map(_topic_part, path)])
+                try:
+                    for below, message in self._built(leaf, stamp, str(getattr(item, "frame_id", ""))).items():
+                        self._write_message(topic + below, name, message, stamp)
+                except ValueError as error:
+                    lost[name] = str(error)
+        return lost
+
+    def _write_message(self, topic: str, name: str, message: Any, stamp: int) -> None:
+        """Write a message of the stream or part of this name."""
+        owner = self._owners.setdefault(topic, name)
+        if owner != name:
+            raise ValueError(f"its topic {topic} is that of '{owner}'; rename one")
+        self._writer.write(topic, message, stamp)
+        self.empty = False
 
     def _built(self, leaf: Any, stamp: int, frame_id: str) -> dict[str, Any]:
         """The messages of a value, by the part of their topic below that of the stream."""

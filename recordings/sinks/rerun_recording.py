@@ -128,8 +128,8 @@ class RerunRecording:
         if self._viewer is not None:
             self._viewer.grown()
 
-    def write(self, record: FrameRecord) -> None:
-        """Draw one frame."""
+    def write(self, record: FrameRecord) -> dict[str, str]:
+        """Draw one frame; returns why streams of own types have no picture in it."""
         check_room(self._partial, self._path)
         with catch_and_log_exceptions(strict=True):
             canvas, self._stamp = self._canvas, max(record.stamp, self._stamp)
@@ -137,7 +137,7 @@ class RerunRecording:
             self._choose_pictures(record.items)
             for stream in record.unchanged:
                 canvas.keep_all(stream)
-            captions = self._draw(record.items)
+            captions, lost = self._draw(record.items)
             self._plot_work(record)
             canvas.clear_missing()
             canvas.log_text(FRAMES, "; ".join([f"{sum(record.seconds.values()):.2f} s of work", *captions]))
@@ -151,6 +151,7 @@ class RerunRecording:
                 self._recording.flush()  # a viewer shows each frame at once
                 self._viewer.grown()
         self._frames += 1
+        return lost
 
     def checkpoint(self) -> Saved:
         """What the recording contains. All of it is in the file by now."""
@@ -257,11 +258,12 @@ class RerunRecording:
         self._drawn += canvas.pictures
         canvas.full_size = self._finals.union(_last_of(StereoFrame, items))
 
-    def _draw(self, items: Mapping[str, Any]) -> list[str]:
-        """Log the items of a frame; returns their captions, but for the streams inside a template."""
+    def _draw(self, items: Mapping[str, Any]) -> tuple[list[str], dict[str, str]]:
+        """Log the items of a frame; returns their captions, but for the streams inside a template, and the streams of
+        own types without a picture -> why."""
         present = {stream: items[stream] for stream in self._streams if stream in items}
         last = {_shown(stream, item): stream for stream, item in present.items()}
-        captions = []
+        captions, lost = list[str | None](), dict[str, str]()
         for stream, item in present.items():
             later = last[_shown(stream, item)]
             if later != stream and getattr(item, "layers", {}).keys() <= getattr(present[later], "layers", {}).keys():
@@ -269,13 +271,18 @@ class RerunRecording:
             if (kind := type(item)) not in self._loggers:
                 fitting = [log for kinds, log in LOGGERS.items() if len(kinds) == 1 and issubclass(kind, kinds[0])]
                 self._loggers[kind] = fitting or [log_own]
-            texts = [log(self._canvas, stream, item) for log in self._loggers[kind]]
+            try:
+                texts = [log(self._canvas, stream, item) for log in self._loggers[kind]]
+            except (ValueError, TypeError, OverflowError) as error:
+                if self._loggers[kind] != [log_own]:
+                    raise
+                texts, lost[stream] = [], str(error)
             captions += texts if "/" not in stream else []
         for kinds, log in LOGGERS.items():
             if len(kinds) > 1:
                 for chosen in _together(present, kinds, self._finals):
                     captions.append(log(self._canvas, chosen[0], *(present[stream] for stream in chosen)))
-        return [caption for caption in captions if caption]
+        return [caption for caption in captions if caption], lost
 
     def _plot_work(self, record: FrameRecord) -> None:
         """Plot the times of the stages and their queues; a frame without a stage has a gap in its line."""

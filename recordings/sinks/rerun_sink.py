@@ -88,11 +88,12 @@ class RerunSink(Checked):
         refuse_foreign(path, "recording")
         self._recording = RerunRecording(self, path, streams, about)
 
-    def write(self, record: FrameRecord) -> None:
-        """Draw one frame. May be called from any thread, one call at a time."""
+    def write(self, record: FrameRecord) -> dict[str, str]:
+        """Draw one frame; returns why streams have no picture in it. May be called from any thread, one call at a
+        time."""
         if self._recording is None:
             raise LogError("RerunSink is not open")
-        self._recording.write(record)
+        return self._recording.write(record)
 
     def checkpoint(self) -> Saved:
         """What the recording contains by now."""

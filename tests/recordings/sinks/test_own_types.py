@@ -1,5 +1,6 @@
 """Images, numbers, texts, tables and dataclasses of a stage are drawn, and written in a standard form."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from recordings.results import read_result
 from recordings.ros2.plain import array_of
 from recordings.sinks.own_types import leaves, refusal
 from stages.data import Disparity, StereoFrame, Transform
+from stages.stage import Stage
 from tests.conftest import FRAMES, roverflow
 from tests.recordings.sinks.recorded_scene import START, Record, decoded, entities, record_of, rows, scene
 from tests.recordings.sinks.test_mcap_sink import last_messages, logged
@@ -48,6 +50,30 @@ class Sharpness:
 class Edges:
     def __call__(self, frame: StereoFrame) -> NDArray[np.uint8]:
         return np.asarray(cv2.Canny(np.ascontiguousarray(frame.left), 50, 100))
+
+
+@dataclass(frozen=True)
+class Surrogates(Stage):
+    """A text, in its second frame of half a character."""
+
+    def start(self) -> list[StereoFrame]:
+        return []
+
+    def __call__(self, frame: StereoFrame, *, state: list[StereoFrame]) -> str:
+        state.append(frame)
+        return "\ud800" if len(state) == 2 else "dusty"
+
+
+@dataclass(frozen=True)
+class Columns(Stage):
+    """An image of four columns, but of three in its second frame, which makes it points."""
+
+    def start(self) -> list[StereoFrame]:
+        return []
+
+    def __call__(self, frame: StereoFrame, *, state: list[StereoFrame]) -> NDArray[np.float32]:
+        state.append(frame)
+        return np.ones((5, 3 if len(state) == 2 else 4), np.float32)
 
 
 @dataclass(frozen=True)
@@ -142,18 +168,41 @@ def test_an_array_of_more_dimensions_is_read_back_in_its_shape(tmp_path):
     np.testing.assert_array_equal(array_of(read), tensor)
 
 
-LARGE = "cannot write 'own': a whole number beyond 64 bits has no standard form"
+LARGE = "a whole number beyond 64 bits has no standard form"
 
 
-@pytest.mark.parametrize(("kind", "value", "why"), [
-    (dict[str, float], {"a b": 1.0, "a_b": 2.0}, "cannot write both 'own/a b' and 'own/a_b' to /nav/own/a_b"),
-    (dict, {"a": b"raw"}, "cannot write 'own/a': a value of type bytes has no standard form"),  # unlike its annotation
-    (str, "\ud800", "cannot write 'own': 'utf-8' codec can't encode"),
-    (int, 1 << 63, LARGE), (int, -(1 << 63) - 1, LARGE), (np.ndarray, np.array([1, 1 << 63], np.uint64), LARGE),
+@pytest.mark.parametrize(("kind", "value", "part", "why"), [
+    (dict[str, float], {"a b": 1.0, "a_b": 2.0}, "own/a_b", "its topic /nav/own/a_b is that of 'own/a b'; rename one"),
+    (dict, {"a": b"raw"}, "own/a", "a value of type bytes has no standard form"),  # unlike its annotation
+    (str, "\ud800", "own", "'utf-8' codec can't encode character"),
+    (list[float], [[1.0], [1.0, 2.0]], "own", "setting an array element with a sequence"),
+    (int, 1 << 63, "own", LARGE), (int, -(1 << 63) - 1, "own", LARGE),
+    (np.ndarray, np.array([1, 1 << 63], np.uint64), "own", LARGE),
 ])  # fmt: skip
-def test_a_value_without_a_message_or_a_topic_is_an_error(tmp_path, kind, value, why):
-    with pytest.raises(LogError, match=why):
-        written(tmp_path / "out.mcap", {"own": kind}, {"own": value})
+def test_a_value_without_a_message_or_a_topic_is_a_loss(tmp_path, kind, value, part, why):
+    sink = McapSink(results=("own",))
+    sink.open(tmp_path / "out.mcap", {"own": kind}, {})
+    lost = sink.write(Record(START, {"own": value}))
+    sink.discard()
+    assert [*lost] == [part]
+    assert lost[part].startswith(why)
+
+
+def test_values_without_a_form_in_one_frame_are_losses_of_that_frame(tmp_path, traverse, capsys):
+    file, out, summary = tmp_path / "own.yaml", tmp_path / "out.mcap", tmp_path / "summary.json"
+    file.write_text(PIPELINE.replace("Sharpness", "Surrogates").replace("Edges", "Columns"))
+    assert roverflow("run", traverse, "-p", file, "-o", out, "--workers", 2, "--summary", summary) == 3
+    lost = {(loss["stage"], loss["stream"]) for loss in json.loads(summary.read_text())["ledger"]}
+    assert lost == {
+        ("recordings.McapSink", "sharpness"), ("recordings.McapSink", "edges"), ("recordings.RerunSink", "sharpness")
+    }  # fmt: skip
+    assert "  2 unwritable, first: edges at " in capsys.readouterr().out
+    read = list(iter_decoded(out, ["/nav/sharpness", "/nav/edges"]))
+    assert [topic for topic, *_ in read] == (FRAMES - 1) * ["/nav/sharpness", "/nav/edges"]
+    statuses = last_messages(out)["/nav/diagnostics"].status
+    assert [status.name for status in statuses if status.message.startswith("topic /nav/edges has the type ")] == [
+        "recordings.McapSink/edges"
+    ]
 
 
 @pytest.mark.parametrize(("kind", "why"), [
