@@ -26,6 +26,9 @@ MIN_BASELINE, MAX_BASELINE = 1 / 500, 10.0  # of the camera's height; beyond, it
 ASSUMED_HEIGHT = 1.0  # m, of a camera whose height is unknown
 BASELINE_RTOL = 0.05  # two baselines that differ by less agree
 MIN_FOCAL_PX, MAX_FOCAL_PX = 1.0, 1e6
+_SIDE_BY_SIDE = (
+    "but stereo needs both side by side; rotate the images by 90 degrees before they are calibrated and logged"
+)
 MIN_RECTIFIED_SCALE = 0.1  # of the focal length; a smaller rectified image means that D is wrong
 
 
@@ -74,8 +77,8 @@ def calibrated_pair(
         )
     if abs(right.p[1, 3]) > abs(right.p[0, 3]):
         raise LogError(
-            f"the camera of {topics[1]} is above or below that of {topics[0]} (P[1,3] is {right.p[1, 3]:.4g}), but "
-            "stereo needs both side by side; rotate the images by 90 degrees before they are calibrated and logged"
+            f"the camera of {topics[1]} is above or below that of {topics[0]} (P[1,3] is {right.p[1, 3]:.4g}), "
+            f"{_SIDE_BY_SIDE}"
         )
     singles = left.p[0, 3] == 0 and right.p[0, 3] == 0
     right_in_left = _right_in_left(names, tree) if singles else None
@@ -206,10 +209,13 @@ def _right_in_left(names: tuple[str, str], tree: TransformTree) -> Transform:
         )
     translation = right_in_left.translation
     if abs(translation[0]) < 0.9 * np.linalg.norm(translation):
+        above = (
+            f"; or one camera is above the other, {_SIDE_BY_SIDE}" if abs(translation[1]) > abs(translation[2]) else ""
+        )
         raise LogError(
             f"the static transform '{right_in_left.parent}' <- '{right_in_left.child}' has the right camera at "
             f"{translation.round(3).tolist()} m, not beside the left one: these are not optical frames (x right, "
-            "y down, z forward); name optical frames in CameraInfo"
+            f"y down, z forward); name optical frames in CameraInfo{above}"
         )
     return right_in_left
 

@@ -26,7 +26,7 @@ from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
 from recordings.source.cameras import CAMERAS, CalibrationHistory
-from recordings.source.moving_mount import MovingMount
+from recordings.source.moving_mount import MAX_GAP_NS, MovingMount
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.stream_readers import StreamReaders, by_channel
@@ -37,7 +37,7 @@ from stages.data import CameraImage, Mount, Tilt
 
 INTERPOLATION_LEAD_NS = 1_000_000_000  # tilt and pose are read this far beyond a range, for interpolation at its ends
 MAX_CALIBRATION_LAG_NS = 100_000_000  # a calibration may be logged this much later than its image
-MAX_TRANSFORM_LAG_NS = 500_000_000  # the transforms of a moving camera may be this much later
+MAX_TRANSFORM_LAG_NS = MAX_GAP_NS + 500_000_000  # so much later than an image is the next transform logged at most
 _MAX_KEY_INTERVAL = 1000  # frames before a range in which the key frame of a video is searched
 EXCERPT_FRAMES = 4  # so that an excerpt survives a broken frame
 UNSTAMPED = "the header stamps are 0, so log times are used"

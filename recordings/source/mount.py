@@ -38,8 +38,8 @@ def mount_of(
 def pose_of_base(pose: Pose, camera: Camera, base: str, tree: TransformTree) -> Pose:
     """The pose of the frame `base`, or of the camera's rectified image where nothing joins the camera and `base`.
 
-    A pose of a frame that no static transform joins to them is returned as it is. A frame without a name becomes
-    `odom`, because no transform can have it.
+    A pose of the camera's own frame becomes that of its rectified image. A pose of a frame that no static transform
+    joins to them is returned as it is. A frame without a name becomes `odom`, because no transform can have it.
     """
     pose = pose if pose.frame_id else replace(pose, frame_id=ODOMETRY_FRAME)
     of = pose.child_frame_id

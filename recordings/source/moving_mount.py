@@ -7,9 +7,9 @@ the tilt is.
 from __future__ import annotations
 
 from bisect import bisect_right, insort
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain, islice, pairwise
+from itertools import chain, pairwise
 from operator import itemgetter
 from typing import Any
 
@@ -29,7 +29,7 @@ from stages.data import Mount, Transform
 JOINTS = "sensor_msgs/msg/JointState"
 MAX_GAP_NS = 1_000_000_000  # between two messages of a transform
 MAX_SAMPLES = 5000  # of a transform, so that memory does not grow
-MAX_LOOKED_AT = 200  # messages of each topic, to find the transforms
+MAX_CLOCK_NS = 60_000_000_000  # between frames and the messages of a transform, beyond which their clocks differ
 
 Link = tuple[str, str]  # parent and child
 
@@ -88,8 +88,23 @@ class MovingMount:
         for (parent, child), stamps in self.lost.items():
             first, last = ((stamp - begin) / 1e9 for stamp in (stamps[0], stamps[-1]))
             lacking = f"{counted(len(stamps), 'frame')} from {first:+.1f} s to {last:+.1f} s"
-            found.append(f"'{parent}' <- '{child}' has a gap: {lacking} lack it, and their images are lost")
+            why = self._why_lost((parent, child), stamps)
+            found.append(f"'{parent}' <- '{child}' {why}: {lacking} lack it, and their images are lost")
         return "; ".join(found)
+
+    def _why_lost(self, link: Link, stamps: Sequence[int]) -> str:
+        """Why frames of these stamps lack a transform, by its samples at the end."""
+        samples = self.samples[link]
+        if not samples:
+            return "has no message that can be read"
+        ahead = max(samples[0][0] - stamps[-1], stamps[0] - samples[-1][0])
+        if ahead > MAX_CLOCK_NS:
+            return (
+                f"has stamps of another clock, {ahead / 1e9:.1f} s off those of the images; record both with one clock"
+            )
+        if not any(isinstance(attempt(_interpolated, link, samples, stamp), LogError) for stamp in stamps):
+            return "is logged too late"
+        return "has a gap"
 
     def first(self) -> Mount:
         """The mount at the first time at which all transforms are known."""
@@ -103,30 +118,69 @@ class MovingMount:
         raise why
 
 
+@dataclass(frozen=True, eq=False)
+class MovingTransforms:
+    """The transforms of a log that may move, as found in samples of each topic.
+
+    messages: topic -> those messages; links: topic -> its transforms; joints: by name.
+    """
+
+    messages: Mapping[str, Sequence[Any]]
+    links: Mapping[str, Collection[Link]]
+    joints: Mapping[str, Joint]
+
+    @classmethod
+    def of(cls, topics: DecodedTopics, joints: Mapping[str, Joint], most: int | None) -> MovingTransforms:
+        """Those of a log. joints: of the source, without which angles of joints are not read; most: messages of each
+        part of the log."""
+        found = dict[str, list[Any]]()
+        for topic, schema in sorted(topics.schemas.items()):
+            if (schema == TRANSFORMS and not topic.endswith("tf_static")) or (schema == JOINTS and joints):
+                read = topics.sample(topic, lambda message: message, most)
+                found[topic] = [message for message in read if not isinstance(message, LogError)]
+        links = {
+            topic: {link for each in messages for link in _links_in(each, joints)} for topic, messages in found.items()
+        }
+        return cls(found, links, joints)
+
+    @property
+    def of_joints(self) -> set[Link]:
+        """The transforms by joints of which the log has angles."""
+        turned = {(joint.origin.parent, joint.origin.child) for joint in self.joints.values()}
+        return turned & set().union(*self.links.values())
+
+    def tree(self, static: TransformTree, without: str = "") -> TransformTree:
+        """Static transforms and those that move, at unknown places. without: a frame that none of them places."""
+        still = np.eye(3), np.zeros(3)
+        links = sorted(set().union(*self.links.values()))
+        moving = [link for link in links if link[1] != without and static.between(*link) is None]
+        return static.joined(Transform(*link, *still) for link in moving)
+
+    def contradictions(self, static: TransformTree, frames: Sequence[str]) -> list[LogError]:
+        """The transforms between the first of these frames and the others that contradict static ones, as errors."""
+        paths = [static.path(frames[0], other) for other in frames[1:]]
+        still = {frozenset(step) for path in paths for step in pairwise(path)}
+        found = dict[Link, LogError]()
+        for topic, messages in self.messages.items():
+            for item in chain.from_iterable(getattr(message, "transforms", ()) for message in messages):
+                link = (frame_of(item), frame_name(item.child_frame_id))
+                wrong = attempt(static.add, item) if frozenset(link) in still and link not in found else None
+                if isinstance(wrong, LogError):
+                    found[link] = LogError(f"{topic}: {wrong}")
+        return [*found.values()]
+
+
 def moving_mount(
-    messages: DecodedTopics,
-    camera: Camera,
-    inclinometer: str,
-    base: str,
-    static: TransformTree,
-    joints: Mapping[str, Joint],
+    moves: MovingTransforms, camera: Camera, inclinometer: str, base: str, static: TransformTree
 ) -> MovingMount | None:
     """The mount of a camera that moving transforms join to its inclinometer or to the rover's base, with the first
     samples. None if static transforms join it to both, or if no transform that moves does."""
-    if all(static.between(frame, camera.frame_id) is not None for frame in (inclinometer, base)):
-        return None
-    found, links = dict[str, list[Any]](), dict[str, set[Link]]()
-    for topic, schema in sorted(messages.schemas.items()):
-        if (schema == TRANSFORMS and not topic.endswith("tf_static")) or (schema == JOINTS and joints):
-            read = islice(messages.each(topic, lambda message: message), MAX_LOOKED_AT)
-            found[topic] = [message for message in read if not isinstance(message, LogError)]
-            links[topic] = {link for message in found[topic] for link in _links_in(message, joints)}
-    needed = _needed(camera.frame_id, inclinometer, base, static, set().union(*links.values()))
+    needed = _needed(camera.frame_id, inclinometer, base, static, moves)
     if not needed:
         return None
-    topics = [topic for topic in found if links[topic] & {*needed}]
-    mount = MovingMount(camera, inclinometer, base, static, needed, topics, joints)
-    for message in chain.from_iterable(found[topic] for topic in topics):
+    topics = [topic for topic, links in moves.links.items() if {*links} & {*needed}]
+    mount = MovingMount(camera, inclinometer, base, static, needed, topics, moves.joints)
+    for message in chain.from_iterable(moves.messages[topic] for topic in topics):
         attempt(mount.add, message, 0)
     return mount
 
@@ -156,21 +210,19 @@ def _transforms_in(
 
 
 def _needed(
-    camera: str, inclinometer: str, base: str, static: TransformTree, links: Iterable[Link]
+    camera: str, inclinometer: str, base: str, static: TransformTree, moves: MovingTransforms
 ) -> tuple[Link, ...]:
     """The moving transforms that join the camera to its inclinometer and to the base, where the static ones do not.
 
     What places the base itself is the rover's pose, and is not used.
     """
-    still = np.eye(3), np.zeros(3)
-    moving = [link for link in sorted(links) if link[1] != base and static.between(*link) is None]
-    known = {link: Transform(*link, *still) for link in moving}
-    tree, needed = static.joined(known.values()), dict[Link, None]()
+    tree, needed = moves.tree(static, without=base), dict[Link, None]()
+    moving = set().union(*moves.links.values())
     for frame in (inclinometer, base):
         if static.between(frame, camera) is None:
             path = tree.path(frame, camera)
             steps = [*pairwise(path), *pairwise(path[::-1])]
-            needed |= dict.fromkeys(link for link in steps if link in known)
+            needed |= dict.fromkeys(link for link in steps if link in moving and static.between(*link) is None)
     return tuple(needed)
 
 

@@ -21,15 +21,16 @@ from recordings.source.calibration import Camera, baseline_fault, baseline_note,
 from recordings.source.cameras import CAMERAS, first_calibrations, in_known_frames, mismatched_images
 from recordings.source.joints import read_joints
 from recordings.source.mount import ODOMETRY_FRAME, mount_of, pose_of_base
-from recordings.source.moving_mount import MovingMount, moving_mount
+from recordings.source.moving_mount import MovingMount, MovingTransforms, moving_mount
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_reading import TiltReading
-from recordings.source.topics import DecodedTopics, attempt
+from recordings.source.topics import MAX_TRIED, DecodedTopics, attempt
 from recordings.source.transforms import TransformTree, are_same
 from stages.data import LEVEL_FRAME, Mount, Pose, StereoCamera
 
 _STREAMS = (*CAMERAS, "inclinometer", "odometry")
 _MAX_LISTED = 5  # topics in a sentence
+_FIXED_FRAMES = {"earth", "map", ODOMETRY_FRAME, "world"}  # by REP 105; none of them is a rover's
 _MIN_APART = 0.1  # m, between the poses of two publishers, and
 _MIN_ALTERNATION = 2.0  # times the way from one pose to the next but one; noise reaches 1
 _MIN_POSES = 20
@@ -149,9 +150,9 @@ class SourceResolution:
         if self.tilt is not None:
             notes.append(("inclinometer", self.tilt.note(estimator, self.source)))
         if self.mount is not None and self.mount.base_from_camera is None:
-            others = self._frames_of_camera()
+            others = self._rover_frames()
             notes.append(("mount", (
-                f"no static transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
+                f"no transform joins '{self.source.base_frame}' and the camera, so the map origin is placed "
                 "`points.camera_height` (default 1 m) below the camera and x is its viewing direction"
                 + (f"; set 'base_frame' of the source to the rover's frame ({others})" if others else "")
             )))  # fmt: skip
@@ -210,6 +211,7 @@ class SourceResolution:
         self.tilt_frame = ""
         self.mount: Mount | None = None
         self.moving: MovingMount | None = None
+        self.moves = MovingTransforms({}, {}, {})
         if self.cameras is None:
             why = next(self.unavailable[side] for side in CAMERAS if side in self.unavailable)
             self.unavailable["mount"] = f"the mount needs a calibrated pair of cameras: {why}"
@@ -223,9 +225,18 @@ class SourceResolution:
         if isinstance(joints, LogError):
             self.refused["joints"] = str(joints)
             joints = {}
-        moving = moving_mount(self.messages, self.cameras[0], frame, base, self.static, joints)
+        camera = self.cameras[0]
+        is_fixed = all(self.static.between(name, camera.frame_id) is not None for name in (frame, base))
+        # Most transforms on /tf may be of other frames, but where static ones suffice a few are enough to contradict.
+        self.moves = MovingTransforms.of(self.messages, joints, None if is_fixed and not joints else MAX_TRIED)
+        static = self.static.without(self.moves.of_joints)  # a setting wins over the log
+        self.problems += [("log", error) for error in self.moves.contradictions(static, (camera.frame_id, frame, base))]
+        moving = moving_mount(self.moves, camera, frame, base, static)
+        if joints and (moving is None or not {*moving.links} & self.moves.of_joints):
+            why = "the log has no angles of joints that join the camera and the rover"
+            self.refused["joints"] = f"{why} by {self.source.joints}; correct the names in it, or remove the setting"
         if moving is None:
-            mount = attempt(mount_of, self.cameras[0], frame, base, self.static, given)
+            mount = attempt(mount_of, camera, frame, base, static, given)
         else:
             mount = attempt(moving.first)
             if given is not None:
@@ -236,23 +247,28 @@ class SourceResolution:
         if not isinstance(mount, LogError):
             self.mount, self.moving = mount, moving
             return
-        if joints and moving is None:
-            why = "the log has no angles of joints that join the camera and the rover"
-            self.refused["joints"] = f"{why} by {self.source.joints}; correct the names in it"
         ahead = "if x of the inclinometer points where the camera looks, and z up; a run then names a closer rotation"
         self.remedies["mount"] = [Remedy({"camera_from_inclinometer": [0.5, -0.5, 0.5, 0.5]}, ahead)]
         self.unavailable["mount"] = str(mount)
 
     def _check_base_frame(self) -> None:
-        """Refuse the source's 'base_frame' if the camera is joined to other frames but not to it."""
+        """Refuse the source's 'base_frame' if the camera is joined to other frames but not to it, or if it moves on the
+        frame whose poses the log has."""
         base = self.source.base_frame
-        if base == type(self.source).base_frame or self.mount is None or self.mount.base_from_camera is not None:
+        if base == type(self.source).base_frame or self.mount is None:
             return
-        if others := self._frames_of_camera():
+        said = f"the source's 'base_frame' is set to '{base}', but "
+        others, posed = self._rover_frames(), self._posed_frame()
+        if self.mount.base_from_camera is None and others:
             self.refused["base_frame"] = (
-                f"the source's 'base_frame' is set to '{base}', but /tf_static joins the camera to {others} only; set "
-                "it to one of these, or record its transform to the camera"
+                f"{said}transforms join the camera to {others} only; set it to one of these, or record its transform "
+                "to the camera"
             )
+        if self.mount.base_from_camera is None or not posed or self.static.between(posed, base) is not None:
+            return
+        if self.moves.tree(self.static).between(posed, base) is not None:
+            why = f"this frame moves on '{posed}', whose poses {self.chosen['odometry']} contains"
+            self.refused["base_frame"] = f"{said}{why}; set it to '{posed}'"
 
     def _check_baseline(self) -> None:
         """Note a baseline that cannot be right for the camera's height."""
@@ -263,12 +279,22 @@ class SourceResolution:
         fault = baseline_fault(baseline, 0.0 if base is None else float(base.translation[2]))
         self.findings += [("right", fault)] if fault is not None else []
 
-    def _frames_of_camera(self) -> str:
-        """The frames that /tf_static joins to the camera, without those of the sensors."""
+    def _rover_frames(self) -> str:
+        """The frames that transforms join to the camera and that may be the rover's; the one whose poses the log has,
+        if it is among them."""
         assert self.cameras is not None  # a mount needs them
         own = {self.tilt_frame, *(camera.frame_id for camera in self.cameras)}
-        joined = (name for name in self.static.edges if self.static.between(name, self.cameras[0].frame_id) is not None)
-        return ", ".join(f"'{name}'" for name in sorted(set(joined) - own))
+        tree, camera = self.moves.tree(self.static), self.cameras[0].frame_id
+        joined = {name for name in tree.edges if tree.between(name, camera) is not None} - own - _FIXED_FRAMES
+        posed = self._posed_frame()
+        return ", ".join(f"'{name}'" for name in ([posed] if posed in joined else sorted(joined)))
+
+    def _posed_frame(self) -> str:
+        """The frame whose poses the log has; empty if there is none."""
+        if "odometry" not in self.chosen:
+            return ""
+        pose = self.messages.first(self.chosen["odometry"], lambda message: _pose_of(message, self.source.base_frame))
+        return "" if isinstance(pose, LogError) else pose.child_frame_id
 
     def _resolve_pose(self) -> None:
         """Whether the poses can be used: in a fixed frame, of a frame that is joined to the camera."""

@@ -77,7 +77,7 @@ class LogSettings:
     )
     camera_from_inclinometer: tuple[float, ...] | None = parameter(
         None,
-        "quaternion x, y, z, w from inclinometer to left camera (x right, y down, z forward), "
+        "quaternion x, y, z, w from inclinometer to rectified left camera (x right, y down, z forward), "
         "for a log without static transforms",
     )
     joints: str | None = parameter(

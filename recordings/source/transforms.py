@@ -124,6 +124,16 @@ class TransformTree:
             tree.edges.setdefault(transform.child, {})[transform.parent] = transform.inverse()
         return tree
 
+    def without(self, links: Iterable[tuple[str, str]]) -> TransformTree:
+        """This tree without the transforms of these parents and children."""
+        tree = self.joined(())
+        for parent, child in links:
+            if tree.edges.get(parent, {}).pop(child, None) is not None:
+                del tree.edges[child][parent]
+                if tree.parents.get(child) == parent:
+                    del tree.parents[child]
+        return tree
+
     def listed(self) -> list[str]:
         """Each transform of the log as "parent <- child", sorted."""
         return sorted(f"{parent} <- {child}" for child, parent in self.parents.items())

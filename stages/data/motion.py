@@ -203,7 +203,7 @@ class Mount:
     Parameters
     ----------
     camera_from_inclinometer : (3, 3) float64
-        Rotation from the inclinometer's frame to the left camera's.
+        Rotation from the inclinometer's frame to the rectified left camera's.
     base_from_camera : Transform, optional
         The left camera in the rover's base frame (x forward, y left, z up), if the log contains it.
 

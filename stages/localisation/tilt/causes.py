@@ -29,7 +29,8 @@ MAX_FRAME_GAP = 1.5  # s, for a time offset to be measurable
 _Z_DOWN = "Check the axes of the inclinometer's driver; z of its frame must point up where /tf_static has it so."
 _TURN = (
     "z of its frame points down, as in FRD. Rotate the inclinometer's frame by 180 degrees about {axis} in /tf_static, "
-    "or convert the messages to a frame whose z points up (FLU)."
+    "or convert the messages to a frame whose z points up (FLU). Quaternions with w first look alike: their order must "
+    "be x, y, z, w."
 )
 _REVERSED = (
     "If the log has orientations, z of their world points down, as in NED; convert them to a world with z up (ENU). If "

@@ -233,7 +233,7 @@ def _degrees_as_radians(evidence: Evidence) -> Diagnosis | None:
     fault = "degrees are taken for radians"
     sentence = (
         f"D{fault[1:]}: between frames the tilt swings by {degrees(swing)}, but the camera's rotations allow "
-        f"{degrees(possible)} ({len(near)} pairs of frames). Check the unit of source.pitch and source.roll (deg, not "
-        "rad), or the inclinometer's driver."
+        f"{degrees(possible)} ({len(near)} pairs of frames). Check the inclinometer's driver: the unit of source.pitch "
+        "and source.roll (deg, not rad) for bare angles, that of the gyroscope (rad/s) for an estimated tilt."
     )
     return Diagnosis(fault, sentence, True)

@@ -89,7 +89,9 @@ def test_cameras_that_are_not_parallel_need_rectification(tmp_path, rotation, pl
 def test_a_right_camera_not_beside_the_left_or_exchanged_with_it_is_refused(tmp_path, names, place):
     beside = Transform("left_optical", "right_optical", np.eye(3), place)
     why = f"so {names[0]} is the right camera" if place[0] < 0 else "these are not optical frames"
-    assert why in missing_in(single_calibrations(tmp_path / "log.mcap", names, beside))["left"]
+    refused = missing_in(single_calibrations(tmp_path / "log.mcap", names, beside))["left"]
+    assert why in refused
+    assert ("one camera is above the other, but stereo needs both side by side; rotate" in refused) == (place[1] != 0)
 
 
 @pytest.mark.parametrize(("values", "sentence"), [
@@ -184,8 +186,8 @@ def test_a_pose_is_transformed_to_the_rover_or_its_camera(tmp_path, with_base):
 def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path):
     log = write_sample(tmp_path / "log.mcap")
     why = refused_in(log, base_frame="rover")["base_frame"]
-    assert why.startswith("the source's 'base_frame' is set to 'rover', but /tf_static")
-    assert "joins the camera to 'base_link' only; set it to one of these" in why
+    assert why.startswith("the source's 'base_frame' is set to 'rover', but transforms")
+    assert "transforms join the camera to 'base_link' only; set it to one of these" in why
     assert refused_in(log, base_frame="imu_link") == {}
     of_rover = mounted(*(replace(each, parent="rover") for each in TRANSFORMS))
     with McapSource().open(write_sample(tmp_path / "rover.mcap", of_rover)) as opened:
@@ -193,7 +195,7 @@ def test_the_set_base_frame_must_be_joined_to_the_camera(tmp_path):
     bare = mounted(TRANSFORMS[0].inverse().after(TRANSFORMS[1]))
     with McapSource(base_frame="rover").open(write_sample(tmp_path / "bare.mcap", bare)) as opened:
         assert opened.refused == {}  # the log has no better one
-        assert "no static transform joins 'rover' and the camera" in opened.notes()["mount"]
+        assert "no transform joins 'rover' and the camera" in opened.notes()["mount"]
 
 
 @pytest.mark.parametrize(("problems", "resting"), [("base_link", "imu_link"), ("left_optical", "base_link")])

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from flow.contracts import Severity
+from flow.contracts import Severity, counted
 from recordings import McapSource
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import header, imu, odometry, transform_message
@@ -22,6 +22,7 @@ MS = 1_000_000
 FRAMES, PERIOD, JOINT = 6, 500 * MS, 40 * MS
 ON_MAST = Transform("mast", "left_optical", TRANSFORMS[0].rotation, [0.1, 0.0, 0.0])
 IMU = TRANSFORMS[1]
+HELD = Transform("base_link", "mast", np.eye(3), [0.0, 0.0, 1.0])
 
 
 def pan(stamp: int) -> Transform:
@@ -40,17 +41,21 @@ def joints(stamp: int) -> dict[str, Any] | None:
     return {"/tf": transform_message([(rover, stamp), (pan(stamp), stamp)])}
 
 
-def written(path: Path, messages: Messages = joints, static: tuple[Transform, ...] = (ON_MAST, IMU)) -> Path:
-    """A log with frames between the messages of the mast, which are logged 30 ms late."""
+def written(
+    path: Path, messages: Messages = joints, static: tuple[Transform, ...] = (ON_MAST, IMU), *,
+    late: int = 30 * MS, base: str = "base_link",
+) -> Path:  # fmt: skip
+    """A log with frames between the messages of the mast, which are logged late, ns. base: frame of the poses."""
     logged = [(START, "/tf_static", transform_message([(transform, START) for transform in static]))]
     end = START + FRAMES * PERIOD
     for stamp in range(START, end, JOINT):
         found = messages(stamp) or {}
-        logged += [(stamp + 30 * MS, topic, message) for topic, message in found.items()]
+        for topic, made in found.items():
+            logged += [(stamp + late, topic, message) for message in (made if isinstance(made, list) else [made])]
     for number in range(FRAMES):
         stamp = START + number * PERIOD + 61 * MS
         logged.append((stamp, "/imu/data", imu(stamp, "imu_link", np.array([0, 0, 0, 1.0]))))
-        logged.append((stamp, "/odom", odometry(Pose(stamp, [0, 0, 0], [0, 0, 0, 1], "odom", "base_link"))))
+        logged.append((stamp, "/odom", odometry(Pose(stamp, [0, 0, 0], [0, 0, 0, 1], "odom", base))))
         logged += stereo_rows(stamp, number)
     return write_messages(path, logged)
 
@@ -127,9 +132,11 @@ def test_a_mast_that_stands_still_may_be_logged_rarely(tmp_path):
 
 
 def test_static_transforms_are_preferred_and_the_pose_of_the_rover_is_no_mount(tmp_path):
-    fixed = written(tmp_path / "fixed.mcap", static=(*TRANSFORMS, Transform("base_link", "mast", np.eye(3), [0, 0, 1])))
+    fixed = written(tmp_path / "fixed.mcap", static=(ON_MAST, IMU, HELD))
     mounts, lost, notes = read(fixed)
-    assert (lost, {mount.stamp for mount in mounts}, "mount" in notes) == ([], {0}, False)
+    assert ({mount.stamp for mount in mounts}, "mount" in notes) == ({0}, False)
+    (sentence,) = lost
+    assert sentence.startswith("/tf: the transform 'base_link' <- 'mast' contradicts an earlier one by 30 cm and ")
 
     def by_a_world(stamp):
         camera = Transform("odom", "left_optical", ON_MAST.rotation, np.zeros(3))
@@ -143,6 +150,61 @@ def test_static_transforms_are_preferred_and_the_pose_of_the_rover_is_no_mount(t
 def test_a_fixed_rotation_of_a_camera_that_moves_is_refused(tmp_path):
     fixed = refused_in(written(tmp_path / "log.mcap"), camera_from_inclinometer=(0.0, 0.0, 0.0, 1.0))
     assert "is a fixed rotation, but the camera moves on the rover" in fixed["camera_from_inclinometer"]
+
+
+def test_the_mast_may_be_found_late(tmp_path):
+    """Behind hundreds of messages of the rover's pose, as of a driver that starts later."""
+
+    def late(stamp):
+        rover = Transform("odom", "base_link", np.eye(3), np.zeros(3))
+        poses = [transform_message([(rover, stamp)])] * 20
+        return {"/tf": poses if stamp < START + PERIOD else [*poses, transform_message([(pan(stamp), stamp)])]}
+
+    mounts, lost, _ = read(written(tmp_path / "log.mcap", late))
+    assert (len(mounts), len(lost)) == (FRAMES - 1, 1)
+
+
+def test_a_mast_may_be_logged_once_a_second_and_half_a_second_late(tmp_path):
+    def seldom(stamp):
+        return joints(stamp) if (stamp - START) % (25 * JOINT) == 0 else None
+
+    mounts, lost, _ = read(written(tmp_path / "log.mcap", seldom, late=470 * MS))
+    assert (len(mounts), len(lost)) == (FRAMES - 2, 2)  # none follows the last two
+    assert mounts[1].base_from_camera.translation[2] == pytest.approx(1.00561)
+
+
+@pytest.mark.parametrize(("late", "ahead", "why"), [
+    (1800 * MS, 0, "is logged too late: "), (30 * MS, 0, "has a gap: "),
+    (30 * MS, -10**15, "has stamps of another clock, 999997.1 s off those of the images; record both with one clock: "),
+])  # fmt: skip
+def test_the_cause_of_lost_frames_of_a_moving_camera_is_named(tmp_path, late, ahead, why):
+    def shown(stamp):
+        cut = not ahead and late < PERIOD and stamp > START + 2 * PERIOD
+        return {} if cut else {"/tf": transform_message([(pan(stamp), stamp + ahead)])}
+
+    with McapSource().open(written(tmp_path / "log.mcap", shown, late=late)) as log:
+        lost = [str(item) for _, _, item in log.events() if isinstance(item, Exception)]
+        assert lost
+        assert f"'base_link' <- 'mast' {why}{counted(len(lost), 'frame')} from " in log.faults()["mount"].sentence
+
+
+def test_the_suggested_base_frame_is_that_of_the_poses(tmp_path):
+    """The frames between the camera and the joint that moves are none of the rover's."""
+
+    def renamed(stamp):
+        mast = pan(stamp)
+        return {"/tf": transform_message([(Transform("body", "mast", mast.rotation, mast.translation), stamp)])}
+
+    imu_on_mast = Transform("mast", "imu_link", np.eye(3), np.zeros(3))
+    log = written(tmp_path / "log.mcap", renamed, (ON_MAST, imu_on_mast), base="body")
+    with McapSource().open(log) as opened:
+        assert "set 'base_frame' of the source to the rover's frame ('body')" in opened.notes()["mount"]
+    assert len(read(log, McapSource(base_frame="body"))[0]) == FRAMES
+    assert refused_in(log, base_frame="mast")["base_frame"] == (
+        "the source's 'base_frame' is set to 'mast', but this frame moves on 'body', whose poses /odom contains; set "
+        "it to 'body'"
+    )
+    assert "transforms join the camera to 'body' only" in refused_in(log, base_frame="bodi")["base_frame"]
 
 
 MAST = """
@@ -210,10 +272,20 @@ def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
             assert log.faults() == {}
 
 
+def test_joints_of_the_source_win_over_a_static_transform(tmp_path):
+    (file := tmp_path / "mast.yaml").write_text(MAST)
+    mounts, lost, _ = read(written(tmp_path / "log.mcap", angles, (ON_MAST, IMU, HELD)), McapSource(joints=str(file)))
+    assert lost == []
+    assert [mount.base_from_camera.translation[0] for mount in mounts] == pytest.approx(
+        [pan(mount.stamp).after(ON_MAST).translation[0] for mount in mounts]
+    )
+
+
 def test_joints_that_the_log_has_no_angles_of_are_refused(tmp_path):
     file = tmp_path / "mast.yaml"
     file.write_text("turret: {parent: base_link, child: mast, axis: [0, 0, 1]}")
     log, none = written(tmp_path / "log.mcap", angles), written(tmp_path / "none.mcap", lambda stamp: None)
-    for path in (log, none):
+    fixed = written(tmp_path / "fixed.mcap", angles, (ON_MAST, IMU, HELD))
+    for path in (log, none, fixed):
         why = refused_in(path, joints=str(file))["joints"]
         assert why.startswith("the log has no angles of joints that join the camera and the rover by")
