@@ -190,8 +190,24 @@ def test_the_part_of_a_log_of_several_files_is_scored_as_that_of_one(traverse, t
     half = len(rows) // 2
     files = [write_mcap(tmp_path / "a.mcap", rows[:half]), write_mcap(tmp_path / "b.mcap", rows[half:])]
     said(0, "run", *files, "-p", "fast", *SMALL, "-o", out, "--no-rrd", "--end", 1.1)
-    printed = said(0, "score", "--truth", files[0], "--truth", files[1], out).out
-    assert printed.startswith("frames       2 of 2 have results\nnot counted  1 frame outside the part of the log ")
+    counted = "frames       2 of 2 have results\nnot counted  1 frame outside the part of the log "
+    for truths in (files, files[::-1]):
+        given = [word for file in truths for word in ("--truth", file)]
+        code = 0 if truths is files else 3  # in another order, the log is another one
+        assert said(code, "score", *given, out).out.startswith(counted)
+    moved = [shutil.copy(file, tmp_path / f"of-{file.name}") for file in files]
+    assert said(0, "score", "--truth", moved[0], "--truth", moved[1], out).out.startswith(counted)
+
+
+def test_a_truth_of_another_traverse_is_noted(traverse, fast_result, tmp_path, said):
+    """Seeds fix the stamps, so that they do not distinguish the traverses."""
+    other, none = tmp_path / "traverse.mcap", tmp_path / "none.mcap"
+    write_log(Simulation(**{**TRAVERSE, "abundance": 0.5}), other)
+    note = "other input  the log with the truth has other bytes than the input of the run; it may be another traverse"
+    printed = said(3, "score", fast_result, "--truth", other).out
+    assert note in " ".join(printed.split()).replace("other input ", "other input  ")
+    rewrite(traverse, none, lambda topic, _, data: data if topic.startswith("/t") else None)
+    assert "other input" not in said(0, "score", fast_result, "--truth", none).out  # a log of truth alone
 
 
 def test_a_run_without_any_result_replaces_none(tmp_path, said):

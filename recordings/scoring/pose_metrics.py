@@ -32,14 +32,13 @@ class PoseTally:
 
     def __init__(self) -> None:
         self.parts: dict[str, _Part] = {}
-        self.frames = self.missing = self.other_body = 0
+        self.frames = self.missing = 0
         self.max_error = self.max_heading_error = 0.0
 
     def add(self, true: Any, given: Any | None) -> dict[str, float]:
         """Add a frame's true pose and its estimate, None if it has none; returns the frame's own metrics."""
-        if given is None or given.child_frame_id != true.child_frame_id:
-            self.missing += given is None
-            self.other_body += given is not None
+        if given is None:
+            self.missing += 1
             return {}
         (position, rotation), (true_position, true_rotation) = _pose(given), _pose(true)
         part = self.parts.get(given.header.frame_id)
@@ -59,19 +58,17 @@ class PoseTally:
     def metrics(self) -> dict[str, float] | None:
         """The metrics of all poses; None if there was no estimate.
 
-        frames: scored; missing: frames without an estimate; other_body: estimates of another body than the truth's;
-        parts: frames of reference; distance: m driven; drift: the parts' last errors over their distances; max_error:
-        m; max_heading_error: rad.
+        frames: scored; missing: frames without an estimate; parts: frames of reference; distance: m driven; drift: the
+        parts' last errors over their distances; max_error: m; max_heading_error: rad.
         """
-        if not self.frames + self.other_body:
+        if not self.frames:
             return None
         distance = sum(part.distance for part in self.parts.values())
         error = sum(part.error for part in self.parts.values())
         return {
-            "frames": self.frames, "missing": self.missing, "other_body": self.other_body, "parts": len(self.parts),
+            "frames": self.frames, "missing": self.missing, "parts": len(self.parts),
             "distance": distance, "drift": error / distance if distance > 0 else math.nan,
-            "max_error": self.max_error if self.frames else math.nan,
-            "max_heading_error": self.max_heading_error if self.frames else math.nan,
+            "max_error": self.max_error, "max_heading_error": self.max_heading_error,
         }  # fmt: skip
 
 

@@ -16,6 +16,8 @@ from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
+from recordings.containers.digest import log_digest
+from recordings.containers.finding import find_files
 from recordings.containers.opening import open_recording
 from recordings.errors import LogError
 from recordings.mcap.file import McapFile
@@ -79,16 +81,31 @@ def names_of(logs: Sequence[Path]) -> str:
     return ", ".join(names).encode("utf-8", "replace").decode()
 
 
+def is_input(about: Mapping[str, str], logs: Sequence[Path]) -> bool:
+    """Whether a log, its files or its folder, has the bytes of the input of a run. about: the facts of the run."""
+    return about.get("log_digest") == log_digest(find_files(logs).files)
+
+
 def part_run(result: Path, logs: Sequence[Path]) -> tuple[float | None, float | None]:
     """Start and end of the run in its input, s after the first message; None for no limit or if unknown.
 
     logs: the files of the input, or its folder.
     """
     about = about_run(result)
-    if about.get("log") != names_of(logs):
+    if about.get("log") != names_of(logs) and not is_input(about, logs):
         return None, None
     start, end = (float(about[name]) if about.get(name) else None for name in ("start", "end"))
     return start, end
+
+
+def span_run(result: Path, logs: Sequence[Path]) -> tuple[int, int] | None:
+    """The first and the last stamp, ns, of the results of a run of a part of its input, where `part_run` does not know
+    this input; else None. logs: as there."""
+    about = about_run(result)
+    if not (about.get("start") or about.get("end")) or part_run(result, logs) != (None, None):
+        return None
+    stamps = stamps_of(result)
+    return (int(stamps[0]), int(stamps[-1])) if stamps.size else None
 
 
 def stamps_of(result: Path, results: bool = False) -> NDArray[np.int64]:

@@ -24,23 +24,30 @@ from recordings.errors import LogError, sentence_of
 from recordings.mcap.file import McapFile, decoded, iter_decoded
 from recordings.mcap.input_copy import OWN_FRAME
 from recordings.ros2 import from_msg as ros2
-from recordings.scoring.metrics import aligned, angle_between
+from recordings.scoring.contents import (
+    cells_of,
+    layers_of,
+    lens_of,
+    mask_of,
+    place_of,
+    rocks_of,
+    rotation_of,
+    same_camera,
+)  # fmt: skip
+from recordings.scoring.metrics import angle_between
 from recordings.scoring.pose_metrics import PoseTally
-from recordings.scoring.result_log import part_run, stamps_run, without_results
+from recordings.scoring.result_log import about_run, is_input, part_run, span_run, stamps_run, without_results
 from recordings.scoring.side_by_side import Messages, frames
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
-from stages.data import LEVEL_FRAME, Array, Cell, ElevationMap, NavigationMap
-from stages.data.rotations import matrix_of
+from stages.data import LEVEL_FRAME, Cell
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
 TRUTHS = (
     "/truth/disparity", "/truth/occlusion", "/truth/terrain_class", "/truth/elevation_map", "/truth/navigation_map",
     "/truth/rocks", "/truth/tilt", "/truth/pose",
 )  # fmt: skip
-SCORED_LAYERS = {"elevation", "variance", "common_variance", "interpolated"}
 MAX_ORIGIN_ERROR = 0.01  # m, of the distance of a map's origin from the camera
-CAMERA_RTOL = 1e-3  # of focal length and baseline; cameras that differ by less are the same
 
 
 @dataclass
@@ -61,6 +68,8 @@ class Score:
         True frames outside the part that was run (`run --start`, `--end`, `--every`), which are not scored.
     unscored
         Topic -> reason -> number of frames that have it and cannot be scored.
+    other_input
+        Whether the log with the truth has images, but other bytes than the input of the run: perhaps another traverse.
     lost
         Log -> reason -> number of unreadable messages. A true frame without one is scored as far as possible.
     disparity
@@ -71,7 +80,7 @@ class Score:
     tilt
         frames, mean and max error.
     untilted
-        Reason -> number of frames with a true tilt whose own could not be scored.
+        Reason -> number of frames with a true tilt and none of their own.
     pose
         `PoseTally.metrics`.
     per_frame
@@ -86,6 +95,7 @@ class Score:
     unmatched: dict[str, int] = field(default_factory=dict)
     beyond: int = 0
     unscored: dict[str, dict[str, int]] = field(default_factory=dict)
+    other_input: bool = False
     lost: dict[str, dict[str, int]] = field(default_factory=dict)
     disparity: dict[str, Any] | None = None
     terrain: dict[str, Any] | None = None
@@ -129,13 +139,14 @@ def score(result: Path, truth: Path | Sequence[Path], whole: bool = True) -> Sco
         # without topics that have no message, unless messages were lost
         topics = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}
         part = TimeRange.after(log.start, *part_run(result, files))
-        tally = _Tally(result, name, topics, part, stamps_run(result))
+        tally = _Tally(result, name, topics, part, stamps_run(result), span_run(result, files))
+        tally.found.other_input = _is_other(result, files, log)
         results = iter_decoded(result, [*RESULTS, "/nav/pose", "/tf"], tally.lost[str(result)])
         lost, near = tally.lost[name], TimeRange() if whole else part.widened(MAX_LATENESS_NS)
         mounts = decoded(log, ["/tf_static"], lost) if near.edges else ()
-        truths = chain(mounts, decoded(log, [*TRUTHS, "/tf_static"], lost, (near.low, near.high)))
+        truths = chain(mounts, decoded(log, [*TRUTHS, "/tf", "/tf_static"], lost, (near.low, near.high)))
         for stamp, frame in frames(results, tally.noted(truths)):
-            if stamp in tally.outside and not frame.keys() & {*RESULTS}:
+            if stamp in tally.outside and not frame.keys() & {*RESULTS, "/nav/pose"}:
                 tally.found.beyond += 1
                 continue
             try:
@@ -150,13 +161,18 @@ class _Tally:
     """Sums up frames, and keeps one row of metrics of each.
 
     truth: the name of the log with it; truths: its topics; part: of the log that was run; taken: stamps of the frames
-    that it took, None for all.
+    that it took, None for all; span: the first and last of its stamps, None for no limit.
     """
 
-    def __init__(self, result: Path, truth: str, truths: set[str], part: TimeRange, taken: set[int] | None) -> None:
+    def __init__(
+        self, result: Path, truth: str, truths: set[str], part: TimeRange, taken: set[int] | None,
+        span: tuple[int, int] | None,
+    ) -> None:  # fmt: skip
         self.result, self.truth, self.truths, self.part, self.taken = result, truth, truths, part, taken
+        self.span = span
         self.found = Score()
         self.mounts: dict[str, Any] = {}
+        self.distances: dict[str, tuple[float, float]] = {}  # camera -> least and largest distance from base_link, m
         self.fitting = False  # whether a map of any frame was scored
         self.left_out: set[str] = set()  # topics of the current frame
         self.lost: dict[str, Counter[str]] = {log: Counter() for log in (str(result), truth)}
@@ -169,19 +185,37 @@ class _Tally:
         self.pose = PoseTally()
 
     def noted(self, messages: Messages) -> Messages:
-        """The truth's messages but /tf_static; notes mounts, and stamps outside the part of the log that was run."""
+        """The truth's messages but transforms; notes mounts, and stamps outside the part of the log that was run."""
         for topic, time, message in messages:
             if topic == "/tf_static":
                 self.mounts |= {item.child_frame_id: item for item in message.transforms}
+            for item in message.transforms if topic in ("/tf", "/tf_static") else ():
+                self._note_distances(item)
+            if topic in ("/tf", "/tf_static"):
                 continue
             stamp = ros2.stamp_of(message.header)
             left_out = self.taken is not None and stamp not in self.taken
+            if self.span is not None:
+                left_out |= not self.span[0] <= stamp <= self.span[1]
             if left_out or not self.part.has(stamp, time):
                 self.outside.add(stamp)
             yield topic, time, message
 
+    def _note_distances(self, item: Any) -> None:
+        """Note how far cameras are from base_link by a transform of its child, such as a mast that turns."""
+        if item.header.frame_id != "base_link":
+            return
+        turn, shift = rotation_of(item.transform.rotation), place_of(item.transform.translation)
+        found = {item.child_frame_id: float(np.linalg.norm(shift))}
+        for name, mount in self.mounts.items():
+            if mount.header.frame_id == item.child_frame_id:
+                found[name] = float(np.linalg.norm(turn @ place_of(mount.transform.translation) + shift))
+        for name, distance in found.items():
+            low, high = self.distances.get(name, (distance, distance))
+            self.distances[name] = min(low, distance), max(high, distance)
+
     def add(self, stamp: int, frame: dict[str, Any]) -> None:
-        results = [topic for topic in RESULTS if topic in frame]
+        results = [topic for topic in RESULTS if topic in frame] or [*{"/nav/pose"} & frame.keys()]
         self.seen_results.update(results)
         if not any(topic in frame for topic in TRUTHS):
             for topic in results:
@@ -200,7 +234,7 @@ class _Tally:
         if "/truth/tilt" in frame:
             row |= self._add_tilt(frame)
         if "/truth/pose" in frame:
-            row |= self.pose.add(frame["/truth/pose"], frame.get("/nav/pose"))
+            row |= self._add_pose(frame)
         self.found.compared += not self.left_out.issuperset(results)
         self.found.per_frame.append(row)
 
@@ -228,12 +262,12 @@ class _Tally:
                 f"{self.result}: /nav/disparity at {stamp} ns is {estimate.shape[1]}x{estimate.shape[0]}, the truth in "
                 f"{self.truth} is {true.shape[1]}x{true.shape[0]}; score a run of that log"
             )
-        if given is not None and not _same_camera(given, frame["/truth/disparity"]):
-            why = f"its camera has {_lens(given)}, the truth's has {_lens(frame['/truth/disparity'])}"
+        if given is not None and not same_camera(given, frame["/truth/disparity"]):
+            why = f"its camera has {lens_of(given)}, the truth's has {lens_of(frame['/truth/disparity'])}"
             self._leave_out("/nav/disparity", f"{why}: another image, or a wrong calibration")
             return {}
         columns = cropped_columns(frame["/truth/disparity"].max_disparity)
-        occlusion, codes = (_mask(frame, f"/truth/{name}", true.shape) for name in ("occlusion", "terrain_class"))
+        occlusion, codes = (mask_of(frame, f"/truth/{name}", true.shape) for name in ("occlusion", "terrain_class"))
         errors = StereoErrors.of(estimate, true, occlusion, columns)
         self.disparity = self.disparity + errors if self.disparity else errors
         if codes is not None:
@@ -244,12 +278,12 @@ class _Tally:
 
     def _add_terrain(self, frame: dict[str, Any]) -> dict[str, float]:
         true = ros2.read_grid_map(frame["/truth/elevation_map"])
-        hazard = _cells(frame["/truth/navigation_map"], true) == Cell.HAZARD
-        rocks = _rocks(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 6))
+        hazard = cells_of(frame["/truth/navigation_map"], true) == Cell.HAZARD
+        rocks = rocks_of(frame["/truth/rocks"]) if "/truth/rocks" in frame else np.zeros((0, 6))
         ground = TrueGround.of(true, hazard, rocks)
         fitting, unfit = dict[str, Any](), dict[str, str]()
         elsewhere = self._elsewhere(frame)
-        for topic, read in (("/nav/elevation_map", _layers), ("/nav/navigation_map", _cells)):
+        for topic, read in (("/nav/elevation_map", layers_of), ("/nav/navigation_map", cells_of)):
             try:
                 if topic in frame and elsewhere:
                     unfit[topic] = elsewhere
@@ -268,31 +302,40 @@ class _Tally:
     def _elsewhere(self, frame: dict[str, Any]) -> str:
         """Why the maps of a frame have another origin than base_link, as those of the truth have; empty if unknown."""
         for item in frame.get("/tf", ()):
-            mount = self.mounts.get(item.child_frame_id.removeprefix(OWN_FRAME))
-            if mount is not None and mount.header.frame_id == "base_link":
-                places = (each.transform.translation for each in (mount, item))
-                true, found = (float(np.linalg.norm([place.x, place.y, place.z])) for place in places)
+            name = item.child_frame_id.removeprefix(OWN_FRAME)
+            if name in self.mounts and name in self.distances:
+                found = float(np.linalg.norm(place_of(item.transform.translation)))
+                true = float(np.clip(found, *self.distances[name]))
                 if abs(found - true) > MAX_ORIGIN_ERROR:
                     return f"its origin is {found:.2f} m from the camera, the truth's (base_link) {true:.2f} m"
         return ""
+
+    def _add_pose(self, frame: dict[str, Any]) -> dict[str, float]:
+        """The errors of a pose, if it is of the truth's body."""
+        true, given = frame["/truth/pose"], frame.get("/nav/pose")
+        if given is not None and given.child_frame_id != true.child_frame_id:
+            self._leave_out("/nav/pose", f"it is of '{given.child_frame_id}', the truth's of '{true.child_frame_id}'")
+            return {}
+        return self.pose.add(true, given)
 
     def _add_tilt(self, frame: dict[str, Any]) -> dict[str, float]:
         """The tilt's error, by the camera that the truth knows. Viewers' pictures are children of frame `level` too."""
         placed = {item.child_frame_id.removeprefix(OWN_FRAME): item for item in frame.get("/tf", ())}
         true = frame["/truth/tilt"]
-        body, true_up = true.header.frame_id, _rotation(true.quaternion)[2]  # up is in the axes of its header
+        body, true_up = true.header.frame_id, rotation_of(true.quaternion)[2]  # up is in the axes of its header
         mounts = {name: mount for name, mount in self.mounts.items() if mount.header.frame_id == body}
         camera = next((name for name in placed if name == body or name in mounts), None)
         if camera is not None:
             if camera != body:
-                true_up = true_up @ _rotation(mounts[camera].transform.rotation)
+                true_up = true_up @ rotation_of(mounts[camera].transform.rotation)
             # Gravity's opposite in camera axes is independent of the heading.
-            self.tilts.append(angle_between(_rotation(placed[camera].transform.rotation)[2], true_up))
+            self.tilts.append(angle_between(rotation_of(placed[camera].transform.rotation)[2], true_up))
             return {"tilt": self.tilts[-1]}
-        why = f"the truth has no mount of '{next(iter(placed), '')}' on '{body}'"
-        if not placed:
+        if placed:
+            self._leave_out("/tf", f"the truth has no mount of '{next(iter(placed))}' on '{body}'")
+        else:
             why = f"the result has no /tf from '{LEVEL_FRAME}' at that stamp"
-        self.found.untilted[why] = self.found.untilted.get(why, 0) + 1
+            self.found.untilted[why] = self.found.untilted.get(why, 0) + 1
         return {}
 
     def score(self) -> Score:
@@ -306,7 +349,7 @@ class _Tally:
         if not self.seen_results:
             raise without_results(self.result, RESULTS)
         if not found.compared:
-            misfits = [f"{topic}: {why}" for topic in RESULTS for why in found.unscored.get(topic, ())]
+            misfits = [f"{topic}: {why}" for topic, whys in found.unscored.items() for why in whys]
             if misfits:
                 raise LogError(f"{self.result}: no result fits the truth in {self.truth}: {misfits[0]}")
             raise LogError(f"no result in {self.result} has a stamp of {self.truth}; score a run of that log")
@@ -323,57 +366,14 @@ class _Tally:
         return found
 
 
-def _mask(frame: dict[str, Any], topic: str, shape: tuple[int, ...]) -> Array | None:
-    """The pixels of a mono8 image of the truth; None if the frame has none. Raises ValueError for another shape."""
-    if (image := frame.get(topic)) is None:
-        return None
-    if (image.height, image.width) != shape:
-        raise ValueError(f"{topic} is {image.width}x{image.height}, /truth/disparity is {shape[1]}x{shape[0]}")
-    return np.asarray(image.data).reshape(image.height, image.step)[:, : image.width]
-
-
-def _layers(message: Any, onto: ElevationMap) -> dict[str, Array]:
-    """The scored layers of a GridMap, on the cells of `onto`. Raises ValueError if it does not fit."""
-    grid = ros2.read_grid_map(message)
-    wanted = sorted(grid.layers.keys() & SCORED_LAYERS)
-    return {name: _fitted(grid, grid.layers[name], onto, np.nan) for name in wanted}
-
-
-def _cells(message: Any, onto: ElevationMap) -> Array:
-    """The cells of an OccupancyGrid, on the cells of `onto`. Raises ValueError if it does not fit."""
-    grid = ros2.read_occupancy_grid(message)
-    return _fitted(grid, grid.cells, onto, Cell.UNKNOWN)
-
-
-def _fitted(grid: ElevationMap | NavigationMap, values: Array, onto: ElevationMap, missing: float) -> Array:
-    if abs(grid.resolution - onto.resolution) > 1e-4 * onto.resolution:
-        cells = f"its cells are {grid.resolution:g} m wide, the truth's {onto.resolution:g} m"
-        raise ValueError(f"{cells}; run with that resolution")
-    if grid.frame_id != onto.frame_id:
-        raise ValueError(f"it is in frame '{grid.frame_id}', the truth in '{onto.frame_id}'")
-    return aligned(values, grid.origin, onto.shape, onto.origin, onto.resolution, missing)
-
-
-def _same_camera(one: Any, other: Any) -> bool:
-    """Whether two DisparityImages have the same focal length and baseline, where both state them."""
-    ours, theirs = (one.f, one.t), (other.f, other.t)
-    stated = min(*ours, *theirs) > 0  # neither NaN nor 0
-    return not stated or np.allclose(ours, theirs, rtol=CAMERA_RTOL, atol=0)
-
-
-def _lens(disparity: Any) -> str:
-    return f"f = {disparity.f:.6g} px and a baseline of {disparity.t:.4g} m"
-
-
-def _rotation(quaternion: Any) -> Array:
-    return matrix_of([quaternion.x, quaternion.y, quaternion.z, quaternion.w])
-
-
-def _rocks(message: Any) -> Array:
-    """x, y, diameter and height, m, and pixels and shown if present, of /truth/rocks."""
-    fields = ros2.read_point_cloud(message)
-    names = ("x", "y", "diameter", "height", "pixels", "shown")
-    return np.column_stack([fields[name] for name in names if name in fields])
+def _is_other(result: Path, files: Sequence[Path], log: Any) -> bool:
+    """Whether an opened log has images, but other bytes than the input of a result log. files: its."""
+    about = about_run(result)
+    has_images = any(
+        channel.schema is not None and channel.schema.name.endswith("Image") and not channel.topic.startswith("/truth/")
+        for channel in log.channels.values()
+    )
+    return has_images and "log_digest" in about and [*files] != [result] and not is_input(about, files)
 
 
 def _without_nan(value: Any) -> Any:

@@ -5,10 +5,14 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
 from itertools import islice
 from operator import itemgetter
 from typing import Any
 
+import numpy as np
+
+from recordings.errors import LogError
 from recordings.ros2.from_msg import stamp_of
 from stages.data import LEVEL_FRAME
 
@@ -22,16 +26,31 @@ def frames(*logs: Messages) -> Iterator[tuple[int, dict[str, Any]]]:
     """(stamp, {topic: message}) of all frames, each when it is complete.
 
     Of /tf, "/tf" is the list of transforms whose parent is frame `level`. Log times do not count: simulators often
-    log by another clock.
+    log by another clock. Raises LogError for two different messages of a topic at one stamp.
     """
     waiting: dict[int, dict[str, Any]] = {}
     for latest, stamp, topic, message in heapq.merge(*map(_stamped, logs), key=itemgetter(0)):
         frame = waiting.setdefault(stamp, {})
+        if topic != "/tf" and topic in frame and not _are_same(frame[topic], message):
+            raise LogError(f"two messages of {topic} at {stamp} ns differ; give the truth and the result of one log")
         frame[topic] = [*frame.get(topic, []), message] if topic == "/tf" else message
         for stamp in [stamp for stamp in waiting if stamp < latest - MAX_DELAY]:
             yield stamp, waiting.pop(stamp)
     for stamp in sorted(waiting):
         yield stamp, waiting.pop(stamp)
+
+
+def _are_same(one: Any, other: Any) -> bool:
+    """Whether two messages, or parts of them, have the same content."""
+    if is_dataclass(one):
+        return type(one) is type(other) and all(
+            _are_same(getattr(one, item.name), getattr(other, item.name)) for item in fields(one)
+        )
+    if isinstance(one, np.ndarray):
+        return isinstance(other, np.ndarray) and one.tobytes() == other.tobytes()
+    if isinstance(one, list):
+        return len(one) == len(other) and all(map(_are_same, one, other))
+    return repr(one) == repr(other)  # NaN is like NaN
 
 
 def _stamped(messages: Messages) -> Iterator[tuple[int, int, str, Any]]:

@@ -94,6 +94,9 @@ def _frame_lines(found: Score) -> list[str]:
     if found.beyond:
         lines.append(f"not counted  {counted(found.beyond, 'frame')} outside the part of the log that was run")
     notes = []
+    if found.other_input:
+        doubt = "the log with the truth has other bytes than the input of the run; it may be another traverse"
+        notes.append(f"other input  {doubt}")
     for topic, stamps in found.missing.items():
         name, everywhere = topic.removeprefix("/nav/"), len(stamps) == found.frames
         remedy = f"; name the stream '{name}', and let McapSink write it" if everywhere else ""
@@ -210,17 +213,13 @@ def _motion_lines(found: Score) -> list[str]:
 
 def pose_lines(found: dict[str, float]) -> list[str]:
     """The metrics of a `PoseTally` as lines."""
-    lines = []
-    if found["frames"]:
-        drift = "-" if math.isnan(found["drift"]) else f"{100 * found['drift']:.2f}%"
-        parts = f"; {found['parts']} parts in frames of their own" if found["parts"] > 1 else ""
-        lines.append(
-            f"pose         drift {drift} of {found['distance']:.2f} m driven; largest error "
-            f"{100 * found['max_error']:.1f} cm, {math.degrees(found['max_heading_error']):.2f} deg{parts}"
-        )
-    for key, why in (("missing", "the result has no pose"), ("other_body", "it is not of base_link, as the truth is")):
-        if found[key]:
-            lines.append(f"pose         not scored in {counted(int(found[key]), 'frame')}: {why}")
+    drift = "-" if math.isnan(found["drift"]) else f"{100 * found['drift']:.2f}%"
+    parts = f"; {found['parts']} parts in frames of their own" if found["parts"] > 1 else ""
+    error = f"{100 * found['max_error']:.1f} cm, {math.degrees(found['max_heading_error']):.2f} deg{parts}"
+    lines = [f"pose         drift {drift} of {found['distance']:.2f} m driven; largest error {error}"]
+    if found["missing"]:
+        missing = counted(int(found["missing"]), "frame")
+        lines.append(f"pose         not scored in {missing}: the result has no pose")
     return lines
 
 

@@ -182,9 +182,11 @@ def _hazards(truth: TrueGround, cells: Array) -> dict[str, int]:
     """Sums over the cells of one frame.
 
     Of visible cells: hazards, those detected, those called free; cells on a rock, those called free; safe cells, those
-    called hazards, also by slope; unknown cells. Of all cells called free: those on a rock, and those out of view.
+    called hazards, also by slope; unknown cells. Of all cells within 8 m called free: those on a rock, and those out of
+    view.
     """
-    free, flagged, seen = cells == Cell.FREE, cells == Cell.HAZARD, truth.seen
+    within = in_ring(np.hypot(truth.x[None, :], truth.y[:, None]), 0.0, MAX_DISTANCE)
+    free, flagged, seen = (cells == Cell.FREE) & within, cells == Cell.HAZARD, truth.seen
     on_rock = truth.rock >= np.float32(HIGH_ROCK)
     safe = seen & ~truth.hazard
     masks = {

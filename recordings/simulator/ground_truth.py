@@ -1,7 +1,8 @@
 """The exact truth of a simulated frame: disparities, maps with their visibility, and rocks.
 
 Disparity comes from the rays of the left image. Elevation and hazards come from vertical rays onto the cell centres, in
-the level frame of the true tilt. A cell is in view if a line of sight from each camera reaches any of nine points of
+the level frame of the true tilt. The region is what is within 8 m of base_link, horizontally, or of the left camera. A
+cell is in view if a line of sight from each camera reaches any of nine points of
 its surface, whether or not a pixel is on that line: a map may have values between pixels, but not behind an obstacle.
 """
 
@@ -15,7 +16,7 @@ from recordings.ros2.to_msg import exact_disparity
 from recordings.simulator import raycast
 from recordings.simulator.simulation import FrameTruth, Simulation
 from stages.compiled.jit import typed_kernel
-from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap
+from stages.data import LEVEL_FRAME, Array, Cell, CellReason, Disparity, ElevationMap, NavigationMap, Transform
 
 CELL_POINTS = 3  # along each side of a cell
 SIGHT_TOLERANCE = 0.002  # m before its end that a line of sight may stop
@@ -59,7 +60,7 @@ def truth_maps(simulation: Simulation, stamp: int, truth: FrameTruth) -> tuple[E
 
 def visible_cells(simulation: Simulation, truth: FrameTruth, count: int) -> Array:
     """(count, count) float32: 1 where a pixel that both cameras see hits the cell within the region, else 0."""
-    mount = truth.level.inverse().after(truth.base.after(truth.mounts[0]))
+    mount = _camera_in_level(truth)
     a, b, known = _seen_within(simulation, truth)
     rows = slice(int(np.argmax(known.any(axis=1))), None)  # sky and far ground above them
     known, b, places = known[rows], b[rows], []
@@ -106,10 +107,21 @@ def rocks_in_view(simulation: Simulation, truth: FrameTruth) -> Array:
 
 def _seen_within(simulation: Simulation, truth: FrameTruth) -> tuple[Array, Array, Array]:
     """The rays' slopes, across (W,) and down (H, 1), and which pixels (H, W) both cameras see within the region."""
-    camera = simulation.camera
+    camera, mount = simulation.camera, _camera_in_level(truth)
     a = (np.arange(camera.width) - camera.cx) / camera.fx
     b = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
-    return a, b, (truth.seen == 255) & (truth.depth <= simulation.region / np.sqrt(a**2 + b**2 + 1))
+    both, slant = truth.seen == 255, np.sqrt(a**2 + b**2 + 1)
+    within = both & (truth.depth <= simulation.region / slant)
+    row, column = np.nonzero(both & ~within & (truth.depth <= 2 * simulation.region / slant))  # farther under a mast
+    depth, (right, down, ahead) = truth.depth[row, column], mount.rotation[:2].T[:, :, None]
+    place = depth * (right * a[column] + down * b[row, 0] + ahead) + mount.translation[:2, None]
+    within[row, column] = np.hypot(*place) <= simulation.region
+    return a, b, within
+
+
+def _camera_in_level(truth: FrameTruth) -> Transform:
+    """Level frame <- left camera."""
+    return truth.level.inverse().after(truth.base.after(truth.mounts[0]))
 
 
 def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, top: Array, visible: Array,
@@ -149,7 +161,9 @@ def _map_layers(simulation: Simulation, truth: FrameTruth, x: Array, y: Array, t
 def in_sight(simulation: Simulation, truth: FrameTruth, points: Array) -> Array:
     """Which points (N, 3) of the world, m, both cameras see within the region: (N,) bool."""
     eyes = [truth.base.after(mount) for mount in truth.mounts]
-    seen: Array = np.linalg.norm(points - eyes[0].translation, axis=1) <= simulation.region
+    aside = np.hypot(*truth.level.inverse()(points)[:, :2].T)
+    slant = np.linalg.norm(points - eyes[0].translation, axis=1)
+    seen: Array = np.fmin(aside, slant) <= simulation.region
     for eye in eyes:
         seen &= _within_image(simulation, (points - eye.translation) @ eye.rotation)
         asked = np.flatnonzero(seen)

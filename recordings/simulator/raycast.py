@@ -272,23 +272,24 @@ def cast_rows(
 @borrowing_kernel
 def seen_rows(
     scn: Any, left: Any, right: Any, rotation: Any, fx: float, fy: float, cx: float, cy: float, first: int,
-    depth: Any, seen: Any,
+    depth: Any, height: int, row_offset: float, seen: Any,
 ) -> None:  # fmt: skip
     """Which hits of `cast_rows` the right camera sees too, into seen (rows, W) uint8.
 
-    255 seen by both, 128 hidden from the right camera or outside its image, 0 no surface. left, right: (3,) cameras, m.
+    255 seen by both, 128 hidden from the right camera or outside its image, 0 no surface. left, right: (3,) cameras, m;
+    height: of the images, px; row_offset: of the right image's rows, px.
     """
     baseline = sqrt((right[0] - left[0]) ** 2 + (right[1] - left[1]) ** 2 + (right[2] - left[2]) ** 2)
     width = depth.shape[1]
     for row in range(depth.shape[0]):
-        b = (first + row - cy) / fy
+        b, place = (first + row - cy) / fy, first + row + row_offset + 0.5
         for column in range(width):
             t = depth[row, column]
             if t == inf:
                 seen[row, column] = 0
                 continue
             seen[row, column] = 128
-            if column - fx * baseline / t + 0.5 < 0:
+            if column - fx * baseline / t + 0.5 < 0 or place < 0 or place > height:
                 continue
             a = (column - cx) / fx
             # From the right camera, at unit speed along the optical axis, the ray reaches the point at t:

@@ -150,7 +150,9 @@ class Simulation:
         0.0, "largest turn of the mast with the cameras, to the left and to the right", unit="rad", low=0, high=_rad(90)
     )
     pan_time: float = parameter(8.0, "time in which the mast turns to both sides and back", unit="s", low=0.1, high=1e4)
-    region: float = parameter(8.0, "largest distance of a visible cell", unit="m", low=0.1, high=100)
+    region: float = parameter(
+        8.0, "largest distance of a visible cell from base_link or the left camera", unit="m", low=0.1, high=100
+    )
     seed: int = parameter(1, "seed of the random numbers", low=0, high=10**15)
     threads: int = parameter(2, "threads of the computation; the result does not depend on it", low=1, high=1024)
 
@@ -288,7 +290,7 @@ class Simulation:
                 pool,
                 lambda rows: raycast.seen_rows(
                     self.terrain.scene, left.translation, right.translation, left.rotation, *self._intrinsics(),
-                    rows.start, depth[rows], seen[rows],
+                    rows.start, depth[rows], self.height, self.row_offset, seen[rows],
                 ),
             )  # fmt: skip
             other_depth, _, _, other = self._render(right, pool, self.row_offset)

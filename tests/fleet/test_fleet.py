@@ -22,7 +22,7 @@ from flow.cli.fleet.progress import Progress
 from flow.cli.fleet.task import Pipeline, Task, _columns, run_task, unfit
 from flow.errors import UsageError
 from recordings.simulator import Simulation, write_log
-from tests.conftest import chunks_of, roverflow, with_broken
+from tests.conftest import chunks_of, rewrite, roverflow, with_broken
 
 PIPELINE = ("-p", "fast", "--set", "disparities=48")
 TRAP = """
@@ -394,6 +394,11 @@ def test_the_scores_of_a_fleet_are_written_as_json_and_other_logs_are_named(logs
     assert listed[0]["scores"]["density"] == figures["disparity"]["density"]
     assert "--truth is for one result log" in refused("score", tmp_path, "--truth", job.log)
     assert "not merged: junk has no result (unusable)" in said(0, "export", tmp_path, tmp_path / "maps", "--merge").out
+    changed = rewrite(job.log, tmp_path / "b.mcap")
+    for log, code in ((changed, 3), (job.log, 0)):
+        Catalogue(tmp_path).put("a", {"log": str(log)})
+        printed = said(code, "score", tmp_path).out
+        assert ("not scored: a: the log has changed since its run; run the fleet again" in printed) == (code == 3)
     result = tmp_path / "a-nav.mcap"
     with_broken(result, chunks_of(result)[0][0]).replace(result)
     assert re.search(r"not scored: a: the chunk at byte \d+ is broken", said(3, "score", tmp_path).out)

@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
     result = score(options.result, truth)
     write_text(options.json, result.to_json())
     say(format_score(result))
-    return INCOMPLETE if result.lost or result.unscored else COMPLETE
+    return INCOMPLETE if result.lost or result.unscored or result.other_input else COMPLETE
 
 
 def _score_fleet(options: argparse.Namespace) -> int:

@@ -34,7 +34,8 @@ def write_fleet_page(path: Path, folder: Path) -> None:
 
 
 def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], dict[str, str], set[str]]:
-    """Pipeline -> log -> score; log -> why it has no score; and those of them whose result is gone or damaged.
+    """Pipeline -> log -> score; log -> why it has no score; and those of them whose result is gone or damaged, or
+    whose log has changed.
 
     The catalogue keeps the scores.
     """
@@ -50,6 +51,9 @@ def score_logs(folder: Path) -> tuple[dict[str, dict[str, Score]], dict[str, str
             if found.lost:
                 damaged.add(row["name"])
                 raise LogError("; ".join(why for reasons in found.lost.values() for why in reasons))
+            if found.other_input:
+                damaged.add(row["name"])
+                raise LogError("the log has changed since its run; run the fleet again")
         except LogError as error:  # the log has no truth, is gone or damaged
             others[row["name"]] = str(error)
             continue

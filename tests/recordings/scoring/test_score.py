@@ -4,6 +4,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,8 @@ from recordings.scoring.table import (
 )  # fmt: skip
 from recordings.simulator import write_log
 from recordings.simulator.texture import TerrainClass
-from stages.data import ElevationMap
-from tests.conftest import chunks_of, edit_of, halves, rewrite, with_broken
+from stages.data import ElevationMap, Pose, Transform
+from tests.conftest import chunks_of, edit_of, halves, rewrite, with_broken, write_messages
 from tests.recordings.scoring.known_run import BLIND, SMALL, Run, frame_of, truth_of
 
 
@@ -167,6 +168,49 @@ def test_the_columns_of_several_rows_have_their_units():
     assert brief_columns([]) == {}
 
 
+def test_a_pose_is_scored_alone_if_it_is_of_the_body_of_the_truth(tmp_path, truth):
+    def posed(child):
+        rows = [(SMALL.stamp(index), child) for index in range(SMALL.frames)]
+        poses = [
+            (stamp, "/nav/pose", ros2.odometry(Pose(stamp, [0, 0, 0], [0, 0, 0, 1], "odom", name)))
+            for stamp, name in rows
+        ]
+        return write_messages(tmp_path / f"{child}.mcap", poses)
+
+    assert scoring.score(posed("base_link"), truth).pose["frames"] == SMALL.frames
+    with pytest.raises(
+        LogError, match=r"no result fits the truth in .*: /nav/pose: it is of 'imu', the truth's of 'base_"
+    ):
+        scoring.score(posed("imu"), truth)
+
+
+def test_truths_of_two_logs_at_one_stamp_are_refused(tmp_path, truth):
+    other = tmp_path / "other.mcap"
+    write_log(replace(SMALL, abundance=SMALL.abundance / 2), other)
+    result = Run().write(tmp_path / "out.mcap")
+    with pytest.raises(
+        LogError, match=r"two messages of /truth/\w+ at \d+ ns differ; give the truth and the result of"
+    ):
+        scoring.score(result, [truth, other])
+    assert scoring.score(result, [truth, truth]).compared == SMALL.frames
+
+
+@pytest.mark.parametrize("lower", [0.0, 0.1])
+def test_the_origin_of_maps_is_checked_under_a_mast_that_turns(scored, tmp_path, truth, lower):
+    """The truth's mount of the camera is on the mast, and /tf places the mast."""
+
+    def onto_mast(_, message):
+        message.transforms = [item for item in message.transforms if item.child_frame_id == "left_camera_optical"]
+        message.transforms[0].header.frame_id = "mast"
+
+    mast = Transform("base_link", "mast", np.eye(3), np.zeros(3))
+    log = rewrite(truth, tmp_path / "mast.mcap", edit_of("/tf_static", "tf2_msgs/msg/TFMessage", onto_mast))
+    with Ros2Writer(tmp_path / "tf.mcap") as writer:
+        writer.write("/tf", ros2.transform_message([(mast, SMALL.stamp(0))]), SMALL.stamp(0))
+    found = scoring.score(Run(lower=lower).write(tmp_path / "out.mcap"), [log, tmp_path / "tf.mcap"])
+    assert ("/nav/elevation_map" in found.unscored) == (lower > 0)
+
+
 def test_a_missing_frame_scores_as_one_of_unknown_cells(scored, frames):
     alone = scored(only=("/nav/disparity",))
     assert alone.missing.keys() == {"/nav/elevation_map", "/nav/navigation_map"}
@@ -200,7 +244,7 @@ def test_an_unscored_tilt_has_a_reason(scored):
     assert found.untilted == {"the result has no /tf from 'level' at that stamp": 2}
     assert "not scored in 2 frames: the result has no /tf from 'level'" in format_score(found)
     other = scored(camera="mast_camera")
-    assert other.untilted == {"the truth has no mount of 'mast_camera' on 'left_camera_optical'": 2}
+    assert other.unscored == {"/tf": {"the truth has no mount of 'mast_camera' on 'left_camera_optical'": 2}}
     partly = scored(skipped=(0,))
     assert (partly.tilt["frames"], sum(partly.untilted.values())) == (1, 1)
 

@@ -124,7 +124,7 @@ def test_unknown_is_neither_a_false_alarm_nor_a_detection():
     assert nothing["hazards"]["false_alarm"] == nothing["hazards"]["recall"] == nothing["hazards"]["false_safe"] == 0
     assert nothing["rocks"]["0.2 m"]["detected"] == nothing["rocks"]["0.2 m"]["recall"] == 0
     free = scored(truth, {}, np.zeros((N, N), np.int8))["hazards"]
-    assert free["free_on_rock"] == pytest.approx(np.count_nonzero(truth.rock) / N**2)
+    assert free["free_on_rock"] == pytest.approx(np.count_nonzero(truth.rock) / np.count_nonzero(np.hypot(X, Y) < 8))
     assert free["rock_false_safe"] == free["false_safe"] == 1
     alarmed = np.where(Y > 0, Cell.HAZARD, Cell.UNKNOWN).astype(np.int8)
     hazards = scored(truth, {}, alarmed)["hazards"]
