@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from pathlib import Path
 from resource import RLIM_INFINITY, RLIMIT_FSIZE, getrlimit
 from secrets import token_hex
@@ -24,6 +25,11 @@ def temporary_name(path: Path, mark: str = "") -> Path:
     if path.exists() and not path.is_file():
         raise UnwritableError(f"cannot write {path}: it is not a regular file; give a file name")
     return path.with_name(f"{path.name}.{mark or f'{os.getpid()}-{token_hex(4)}'}.partial")
+
+
+def unfinished(path: Path) -> Iterator[Path]:
+    """The files under temporary names of `path`."""
+    return path.parent.glob(f"{escape(path.name)}.*.partial")
 
 
 def check_writable(path: Path) -> None:

@@ -226,6 +226,14 @@ def test_what_a_kill_has_left_is_removed_with_the_checkpoint(log, stopped):
     assert names(stopped) == ["nav.mcap", "nav.rrd"]
 
 
+def test_what_a_run_of_another_name_is_writing_stays(tmp_path):
+    own, other = tmp_path / "nav [3].mcap.1-ab.partial", tmp_path / "nav 3.mcap.1-ab.partial"
+    for file in (own, other, checkpoint := tmp_path / "nav [3].mcap.checkpoint"):
+        file.write_bytes(checkpoint_file._MAGIC)
+    checkpoint_file.remove_checkpoint([tmp_path / "nav [3].mcap"])
+    assert (own.exists(), other.exists(), checkpoint.exists()) == (False, True, False)
+
+
 @pytest.mark.parametrize("name", ["beside_resumed.py", "package_resumed/inner/part.py"])
 def test_a_changed_module_beside_the_pipeline_is_refused(log, tmp_path, name, monkeypatch):
     monkeypatch.setitem(sys.modules, "package_resumed", ModuleType("package_resumed"))  # is imported

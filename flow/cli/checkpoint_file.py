@@ -12,7 +12,7 @@ from pathlib import Path
 
 from flow.errors import UsageError
 from flow.runtime.checkpoint import Checkpoint
-from recordings.atomic_write import give_name, temporary_name, writing
+from recordings.atomic_write import give_name, temporary_name, unfinished, writing
 from recordings.errors import UnwritableError
 
 INTERVAL = 10.0  # s, between checkpoints
@@ -52,9 +52,9 @@ class CheckpointFile:
             return
         try:
             with writing(self.path):
-                unfinished = _unfinished(self.path)
-                unfinished.write_bytes(_MAGIC + pickle.dumps(self._facts) + pickle.dumps(checkpoint))
-                give_name(unfinished, self.path)
+                partial = _unfinished(self.path)
+                partial.write_bytes(_MAGIC + pickle.dumps(self._facts) + pickle.dumps(checkpoint))
+                give_name(partial, self.path)
         except UnwritableError as error:
             self.give_up(str(error))
         self._next = max(self._next, time.monotonic() + (time.monotonic() - begun) / MAX_SHARE)
@@ -130,8 +130,8 @@ def remove_checkpoint(outputs: Iterable[Path]) -> None:
     path = checkpoint_of(first)
     if path.is_file() and _is_checkpoint(path):
         for output in (first, *others):
-            for unfinished in output.parent.glob(f"{output.name}.*.partial"):
-                unfinished.unlink(missing_ok=True)
+            for left in unfinished(output):
+                left.unlink(missing_ok=True)
         path.unlink()
 
 

@@ -19,7 +19,7 @@ from flow.cli.fleet.engine import Fleet, cluster
 from flow.cli.fleet.jobs import jobs_of, reason_to_run
 from flow.cli.fleet.page import write_fleet_page
 from flow.cli.fleet.progress import Progress
-from flow.cli.fleet.task import Pipeline, Task, _columns, run_task, unfit
+from flow.cli.fleet.task import Pipeline, Task, _columns, remove_unfinished, run_task, unfit
 from flow.errors import UsageError
 from recordings.simulator import Simulation, write_log
 from tests.conftest import chunks_of, rewrite, roverflow, with_broken
@@ -140,6 +140,16 @@ def test_what_another_run_is_writing_stays(logs, tmp_path):
     assert partial.exists()
     assert run_task(task)["state"] == "done"
     assert not partial.exists()
+
+
+def test_what_is_written_for_a_log_of_another_name_stays(logs, tmp_path):
+    job = replace(jobs_of([str(logs / "a.mcap")], tmp_path)[0], name="a[1]")
+    task = Task(job, tmp_path, Pipeline.of("fast", ()), recording=False, workers=1)
+    own, other = tmp_path / "a[1]-nav.mcap.1-0.partial", tmp_path / "a1-nav.mcap.1-0.partial"
+    for file in (own, other):
+        file.touch()
+    remove_unfinished(task)
+    assert (own.exists(), other.exists()) == (False, True)
 
 
 def test_a_name_that_is_too_long_is_a_failure_of_its_log_alone(logs, tmp_path):

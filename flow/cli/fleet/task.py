@@ -25,7 +25,7 @@ from flow.config.templates import SHIPPED
 from flow.contracts import Severity, Verdict
 from flow.errors import RoverflowError, SinkError, UsageError
 from flow.runtime.findings import lines
-from recordings.atomic_write import writing
+from recordings.atomic_write import unfinished, writing
 from recordings.containers.digest import digest_lines
 from recordings.containers.finding import RESULT_ENDING
 from recordings.errors import LogError, UnwritableError
@@ -198,9 +198,9 @@ def _run(task: Task) -> dict[str, Any]:
 def remove_unfinished(task: Task) -> None:
     """Remove what workers that died have left of the task's outputs."""
     for suffix in (".mcap", ".rrd"):
-        for unfinished in task.result.parent.glob(f"{task.result.stem}{suffix}.*.partial"):
+        for left in unfinished(task.result.with_suffix(suffix)):
             with suppress(OSError):
-                unfinished.unlink()
+                left.unlink()
 
 
 def _columns(summary: Mapping[str, Any]) -> dict[str, Any]:
