@@ -225,7 +225,7 @@ class Canvas:
             mask = np.isnan(values).view(np.uint8)
             self._log_raw(f"{view.path}/unknown", rr.SegmentationImage, mask, masking("unknown", UNKNOWN_RGB))
         if unit is not None:
-            self.log_legend(f"{view.path}/scale", values.shape, _scale(low, high, unit, palette, hazard))
+            self.log_legend(f"{view.path}/scale", values.shape, _scale(low, high, unit, palette, hazard, ends[0]))
 
     def log_steps(
         self,
@@ -323,11 +323,15 @@ def _annotations(legend: tuple[tuple[int, tuple[str, Rgb]], ...]) -> tuple[Compo
 
 @lru_cache(maxsize=256)
 def _scale(
-    low: float, high: float, unit: str, palette: int, hazard: float | None = None
+    low: float, high: float, unit: str, palette: int, hazard: float | None = None, begin: float | None = None
 ) -> tuple[tuple[str, Rgb], ...]:
-    """Three values of a colour map, with their colours; the middle one is the limit of hazards, if there is one."""
+    """Three values of a colour map, with their colours; the middle one is the limit of hazards, if there is one.
+
+    begin: where the colours begin, `low` by default.
+    """
     values = np.array([low, (low + high) / 2 if hazard is None else hazard, high])
-    colors = [(int(r), int(g), int(b)) for r, g, b in colormaps.apply_palette(values, low, high, palette)]
+    shades = colormaps.apply_palette(values, low if begin is None else begin, high, palette)
+    colors = [(int(r), int(g), int(b)) for r, g, b in shades]
     units = [unit] * 3 if len(unit) <= MAX_UNIT_CHARS else ["", "", unit]
     names = [f"{colormaps.format_value(value)} {end}".rstrip() for value, end in zip(values, units, strict=True)]
     names[1] = names[1] if hazard is None else f"limit {names[1]}"

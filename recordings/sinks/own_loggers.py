@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import cv2
 import numpy as np
 import rerun as rr
 
@@ -72,6 +71,4 @@ def _log_image(canvas: Canvas, spec: ViewSpec, pixels: Array) -> None:
         canvas.log_exact(spec.path, pixels, spec)
         return
     values = pixels.astype(np.float32)
-    limits = value_limits(values)
-    canvas.log_values(values, limits, spec)
-    canvas.log_scale(f"{spec.path}/scale", pixels.shape, *limits, "", cv2.COLORMAP_TURBO)
+    canvas.log_values(values, value_limits(values), spec, "")

@@ -15,12 +15,37 @@ from recordings.sinks.colormaps import (
     fewer_shades,
 )  # fmt: skip
 from stages.data import LEVEL_FRAME, CellReason, ElevationMap, PixelOrigin, VoxelMap
-from tests.recordings.sinks.recorded_scene import START, Record, entities, record_of, rows, scene
+from tests.recordings.sinks.recorded_scene import (
+    HEIGHT,
+    START,
+    STREAMS,
+    WIDTH,
+    Record,
+    entities,
+    record_of,
+    rows,
+    scene,
+)
 
 
 def labels_of(recording, layer):
     """The labels beside the scale of a layer of the elevation map."""
     return rows(recording, f"/elevation_map/layers/{layer}/scale/text", "Points2D:labels")[0][2]
+
+
+def colours_of(recording, entity):
+    """The colours of the scale of a picture."""
+    shown = rows(recording, f"{entity}/scale", "Points2D:colors")[0][2][:3]
+    return [[rgba >> 24, rgba >> 16 & 255, rgba >> 8 & 255] for rgba in shown]
+
+
+def drawn_colours(recording, entity, hazard=None, palette=cv2.COLORMAP_TURBO):
+    """The colours in which the viewer draws the values of a scale: over the range of the picture."""
+    ((_, _, ((first, last),)),) = rows(recording, entity, "DepthImage:depth_range")
+    labels = rows(recording, f"{entity}/scale/text", "Points2D:labels")[0][2]
+    low, high = (float(label.partition(" ")[0]) for label in labels[::2])
+    middle = (low + high) / 2 if hazard is None else hazard
+    return apply_palette(np.array([low, middle, high]), first, last, palette).tolist()
 
 
 def test_fewer_shades_of_a_relief_leave_unknown_cells_their_colour():
@@ -70,9 +95,19 @@ def test_the_scale_of_a_layer_shows_the_limit_of_the_hazard_rule(tmp_path):
     items = {"elevation_map": replace(terrain, layers=layers)}
     path = record_of(tmp_path / "a.rrd", [Record(START, items)], limits=("elevation_map/step=0.17", "other/step=0.3"))
     assert labels_of(path, "step") == ["0 m", "limit 0.17 m", "0.4 m"]
-    shown = rows(path, "/elevation_map/layers/step/scale", "Points2D:colors")[0][2][1]
-    (expected,) = apply_palette(np.array([0.17]), 0.0, 0.4, cv2.COLORMAP_TURBO).tolist()
-    assert [shown >> 24, shown >> 16 & 255, shown >> 8 & 255] == expected
+    assert colours_of(path, "/elevation_map/layers/step") == drawn_colours(path, "/elevation_map/layers/step", 0.17)
+
+
+def test_scales_have_the_colours_of_the_pictures(tmp_path):
+    random = np.random.default_rng(1)
+    costs = random.integers(0, 256, (2, HEIGHT, WIDTH), np.uint8)
+    items = scene() | {"own": random.integers(0, 2, (HEIGHT, WIDTH)).astype(float)}
+    items["disparity"] = replace(items["disparity"], costs=(costs[0], costs[1]))
+    path = record_of(tmp_path / "a.rrd", [Record(START, items)], streams=STREAMS | {"own": np.ndarray})
+    for entity in ("disparity/confidence", "disparity/cost", "disparity/lead", "elevation_map/layers/slope", "own"):
+        assert colours_of(path, f"/{entity}") == drawn_colours(path, f"/{entity}")
+    elevation = "/elevation_map/layers/elevation"
+    assert colours_of(path, elevation) == drawn_colours(path, elevation, palette=cv2.COLORMAP_VIRIDIS)
 
 
 def test_a_run_gives_the_limits_of_its_hazard_rule(result):
