@@ -55,6 +55,13 @@ def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, s
     check_same(out, result)
 
 
+@pytest.mark.parametrize("serve", [False, True])
+def test_what_watches_a_run_listens_on_loopback_only(monkeypatch, serve):
+    started = replaced(monkeypatch, lambda command: [sys.executable, "-c", "", *command])
+    with watching.watched(not serve, serve, None):
+        assert started[0].args[started[0].args.index("--bind") + 1] == "127.0.0.1"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fate", [signal.SIGSTOP, signal.SIGKILL])
 @pytest.mark.parametrize("how", ["--view", "--serve"])

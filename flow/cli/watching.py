@@ -34,8 +34,8 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
         yield 0
         return
     port, web = _free(PORT), _free(WEB_PORT)
-    page = ["--serve-web", "--bind", "127.0.0.1", "--web-viewer-port", str(web), "--server-memory-limit", LIVE_MEMORY]
-    words = [*page, "--port", str(port)] if serve else ["--port", "auto"]
+    page = ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", LIVE_MEMORY]
+    words = ["--bind", "127.0.0.1", *([*page, "--port", str(port)] if serve else ["--port", "auto"])]
     reading, writing = os.pipe()
     process = subprocess.Popen(
         [sys.executable, "-m", "rerun", *words, "-"],
