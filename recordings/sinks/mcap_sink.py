@@ -120,9 +120,9 @@ class McapSink:
         check_parameters(self)
 
     def wants(self, stream: str, kind: Any) -> bool:
-        """Whether the sink writes a stream of this name and type."""
+        """Whether the sink writes a stream of this name and type, or takes transforms or diagnostics from it."""
         plain = plain_type(kind)
-        used = (TiltHealth, Region, StereoFrame) if self.viewers else (TiltHealth, Region)
+        used = (TiltHealth, Region, PointCloud, *([StereoFrame] if self.viewers else []))
         return stream in self._written or (isinstance(plain, type) and issubclass(plain, used))
 
     def unwritable(self, stream: str, kind: Any) -> str:

@@ -203,7 +203,7 @@ def test_a_run_without_frames_leaves_a_readable_log(tmp_path):
 def test_only_the_named_streams_are_written():
     sink, more = McapSink(results=("disparity",)), McapSink(also=("dense", "points", "diagnosis", "diagnostics"))
     assert sink.wants("disparity", Disparity)
-    assert not sink.wants("points", PointCloud)
+    assert not sink.wants("elevation_map", ElevationMap)
     assert sink.unwritable("disparity", complex).startswith("McapSink cannot write 'disparity': complex has no")
     assert not sink.unwritable("points", complex)
     assert all(more.wants(name, ElevationMap) for name in ("dense", "elevation_map"))
@@ -212,6 +212,15 @@ def test_only_the_named_streams_are_written():
     assert not more.unwritable("diagnosis", Disparity)
     why = more.unwritable("diagnostics", Disparity)
     assert why == "McapSink cannot write 'diagnostics': /nav/diagnostics contains the losses; rename the stream"
+
+
+def test_the_camera_is_placed_also_where_no_points_are_written(tmp_path):
+    sink = McapSink(results=("disparity",))
+    given = {name: item for name, item in items(START).items() if sink.wants(name, STREAMS[name])}
+    read = last_messages(logged(tmp_path / "out.mcap", Record(START, given), results=("disparity",)))
+    assert [topic for topic in read if topic.startswith("/nav/points")] == []
+    (placed,) = read["/tf"].transforms
+    assert (placed.header.frame_id, placed.child_frame_id) == ("level", read["/nav/disparity"].header.frame_id)
 
 
 def test_tf_joins_the_frame_of_a_regional_map_to_frame_level(tmp_path):
