@@ -19,15 +19,14 @@ from rerun.blueprint.encodings import TextLogColumnKind, TimelineColumn
 
 from recordings.containers.finding import first_bytes
 from recordings.errors import LogError
+from recordings.sinks import ENTITIES
 from stages.data import LEVEL_FRAME
 
 APPLICATION = "roverflow"  # whose recordings share the layout that the viewer saves
 CLOCK = "log clock"  # the timeline of the frames' stamps
 FRAME = "frame"  # the timeline that counts frames
 
-LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES = "ledger", "frames", "summary", "seconds", "queues"
-LAYOUT = "layout"  # the text from which other desks are made
-CURVES = "curves"  # the names of the curves of a panel, which stand beside the plot
+LEDGER, FRAMES, SUMMARY, SECONDS, QUEUES, LAYOUT, CURVES = ENTITIES
 SLOWEST = f"{LAYOUT}/slowest"  # those of the slowest stages, which differ from run to run
 LEDGER_CHARS = 80  # of a line of a text log, which the viewer does not wrap
 MAX_LEGEND_LINES = 4  # the legend of more lines would hide the plot

@@ -16,7 +16,7 @@ import numpy as np
 from flow.contracts import FrameRecord
 from flow.parameters import Checked, parameter, set_by_run
 from recordings.errors import LogError
-from recordings.sinks import DESKS
+from recordings.sinks import DESKS, ENTITIES
 from recordings.sinks.overwrite import refuse_foreign
 from recordings.sinks.own_types import NUMBERS, plain_type
 from stages.data import Mount, Region
@@ -77,6 +77,13 @@ class RerunSink(Checked):
             return False
         known = (wanted for kinds in LOGGERS for wanted in kinds)
         return issubclass(plain, (*known, str, *NUMBERS, np.ndarray, Mapping)) or is_dataclass(plain)
+
+    def unwritable(self, stream: str, kind: Any) -> str:
+        """Why the sink cannot draw a stream that it is to draw, in a sentence; empty where it can."""
+        entity = stream.partition("/")[0]
+        if entity not in ENTITIES or not self.wants(stream, kind):
+            return ""
+        return f"RerunSink cannot draw '{stream}': the recording has an entity /{entity} of its own; rename the stream"
 
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Begin a recording.

@@ -323,3 +323,13 @@ def test_streams_may_be_left_out_by_patterns():
     sink = RerunSink(without=("disparity/*", "voxels"))
     wanted = {name: sink.wants(name, Disparity) for name in ("disparity", "disparity/half/full", "voxels")}
     assert wanted == {"disparity": True, "disparity/half/full": False, "voxels": False}
+
+
+@pytest.mark.parametrize("stream", ["layout", "seconds/mean"])
+def test_a_stream_with_the_name_of_an_entity_of_the_recording_is_refused(stream):
+    entity = stream.partition("/")[0]
+    why = f"RerunSink cannot draw '{stream}': the recording has an entity /{entity} of its own; rename the stream"
+    assert RerunSink().unwritable(stream, float) == why
+    assert not RerunSink().unwritable(f"{entity}_of_mine", float)
+    assert not RerunSink().unwritable(stream, Mount)  # which is not drawn
+    assert not RerunSink(without=(stream,)).unwritable(stream, float)
