@@ -259,7 +259,7 @@ def log_health(canvas: Canvas, stream: str, health: TiltHealth) -> str:
 def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     """Shaded relief, the surface in 3-D, and every layer of a frame's own map (hover reads the values).
 
-    Of a regional map only the layers that say which frames it is made of are drawn; the result log has all.
+    A regional map comes seldom, so all are drawn, but only the layers that say which frames they are made of.
     """
     terrain = ahead(terrain)
     elevation, suffix = terrain.layers["elevation"], _frame_suffix(terrain.frame_id)
@@ -270,7 +270,7 @@ def log_terrain(canvas: Canvas, stream: str, terrain: ElevationMap) -> str:
     canvas.log_scale(f"{relief.path}/scale", terrain.shape[::-1], low, high, "m", cv2.COLORMAP_VIRIDIS)
     canvas.log_distances(f"{relief.path}/lines", terrain.shape, terrain)
     caption = f"{stream} {counted(int(np.count_nonzero(known)), 'cell')}"
-    if not canvas.pictures:
+    if not canvas.pictures and terrain.frame_id == LEVEL_FRAME:
         return caption
     step = colormaps.cell_stride(elevation, MAX_CELLS)
     coarse = colormaps.every_nth_cell(terrain, step)

@@ -303,6 +303,17 @@ def test_images_of_every_nth_frame_are_drawn_and_maps_of_all(tmp_path):
     assert "2 of 4" in rows(path, "/summary", "TextDocument:text")[-1][2][0]
 
 
+def test_the_surface_of_a_regional_map_is_drawn_whenever_its_cells_are(tmp_path):
+    terrain, records = replace(scene()["elevation_map"], frame_id="odom"), []
+    for n in range(6):
+        items, unchanged = ({"elevation_map": terrain}, set()) if n % 2 else ({}, {"elevation_map"})
+        records.append(Record(START + n * STEP, items, unchanged=frozenset(unchanged)))
+    path = record_of(tmp_path / "every.rrd", records, every=4)
+    for part, component in (("relief", "EncodedImage:blob"), ("surface", "Mesh3D:vertex_positions")):
+        found = rows(path, f"/elevation_map/{part}", component)
+        assert [(frame, bool(value)) for _, frame, value in found] == [(1, True), (3, True), (5, True)], part
+
+
 def test_a_budget_thins_images_more_and_more_and_is_kept(tmp_path):
     records = []
     for n in range(40):
