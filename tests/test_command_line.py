@@ -219,6 +219,10 @@ def test_a_run_without_any_result_replaces_none(tmp_path, said):
     assert out.read_bytes() == before
     assert "out.mcap was not written because the run produced no results" in printed
     assert out.with_suffix(".rrd").exists()  # which shows why
+    words = ("--set", "McapSink.results=[]", "-p", "paper", "-o", tmp_path / "none.mcap", "--no-rrd")
+    printed = said(0, "run", log, *words).out
+    assert "none.mcap was not written because the run produced no results.\n" in printed
+    assert not (tmp_path / "none.mcap").exists()
 
 
 def test_a_full_disk_keeps_the_partial_and_the_previous_result(traverse, fast_result, tmp_path, said):

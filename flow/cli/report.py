@@ -90,9 +90,8 @@ def report(summary: dict[str, Any], compiled: bool = False) -> None:
     if line := bottleneck_line(summary["bottleneck"]):
         say(f"  {line}")
     for path in summary["withheld"]:
-        losses = (
-            " --summary FILE lists the losses." if summary["ledger"] else " Nothing was lost: the log has no frame."
-        )
+        frameless = "" if summary["frames_in"] else " Nothing was lost: the log has no frame."
+        losses = " --summary FILE lists the losses." if summary["ledger"] else frameless
         say(f"  {path} was not written because the run produced no results.{losses}")
     for path in map(Path, summary["outputs"]):
         say(f"  wrote {path} ({path.stat().st_size / 1e6:.1f} MB)")

@@ -114,7 +114,7 @@ class McapSink:
     _theirs: Mapping[str, str] = field(default_factory=dict, init=False, repr=False)  # frame -> parent in the input
     _rooted: bool = field(default=False, init=False, repr=False)
     _last_stamp: int | None = field(default=None, init=False, repr=False)
-    empty: bool = field(default=False, init=False, repr=False)  # whether none of the streams to write had an item
+    empty: bool = field(default=True, init=False, repr=False)  # whether none of the streams to write had an item
 
     def __post_init__(self) -> None:
         check_parameters(self)
@@ -138,7 +138,7 @@ class McapSink:
     def open(self, path: Path, streams: Mapping[str, type], about: Mapping[str, str]) -> None:
         """Start the log. about: facts of the run, kept as the metadata record "roverflow"."""
         refuse_foreign(path, "result log")
-        self._rooted, self._last_stamp, self.empty = False, None, any(stream in streams for stream in self._written)
+        self._rooted, self._last_stamp, self.empty = False, None, True
         self._kinds, self._owners, self._about = dict(streams), {}, about
         self._theirs = parents_in([Path(log) for log in self.inputs]) if self.inputs else {}
         self._writer = self._writer_class()(Path(path), keep=True, compression=self.compression, digests=True)
