@@ -310,6 +310,30 @@ def test_a_sink_without_an_output_is_refused(traverse, tmp_path, refused, sinks,
     assert not (tmp_path / "out.mcap").exists()
 
 
+@pytest.mark.parametrize(("sink", "options", "printed"), [
+    ("McapSink", ("--rrd", "a.rrd", "--desk", "tilt"), "no sink that writes .rrd files; leave out --rrd and --desk"),
+    ("McapSink", ("--serve",), "no sink that writes .rrd files; leave out --serve"),
+    ("RerunSink", ("-o", "a.mcap", "--with-inputs"), "writes .mcap files; leave out --out and --with-inputs"),
+    ("RerunSink", ("--profile", "foxglove"), "no sink that writes .mcap files; leave out --profile"),
+    ("RerunSink", ("--no-rrd",), "the pipeline writes only .rrd files, and the run is to write none"),
+])  # fmt: skip
+def test_options_of_an_output_that_the_pipeline_does_not_write_are_refused(
+    traverse, tmp_path, refused, monkeypatch, sink, options, printed
+):
+    monkeypatch.chdir(tmp_path)
+    shipped = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(f"{shipped.partition('sinks:')[0]}sinks: [{{use: recordings.{sink}}}]\n")
+    assert printed in refused("run", traverse, "-p", "own.yaml", *options)
+    assert [file.name for file in tmp_path.iterdir()] == ["own.yaml"]
+
+
+def test_recordings_of_a_fleet_whose_pipeline_writes_none_are_refused(traverse, tmp_path, refused):
+    shipped = (ROOT / "flow" / "pipelines" / "paper.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(f"{shipped.partition('sinks:')[0]}sinks: [{{use: recordings.McapSink}}]\n")
+    why = refused("fleet", traverse, "-p", tmp_path / "own.yaml", "--out", tmp_path / "all", "--rrd")
+    assert "the pipeline has no sink that writes .rrd files; leave out --rrd" in why
+
+
 def test_a_run_whose_streams_no_result_log_contains_is_refused(traverse, tmp_path, refused):
     (tmp_path / "own.yaml").write_text("""
 source: {use: recordings.McapSource}

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from flow.errors import UsageError
+from flow.runtime.graph import Graph
 from recordings.atomic_write import check_writable, written
 from recordings.containers.finding import RESULT_ENDING
 from recordings.sinks.overwrite import is_ours
@@ -71,3 +72,11 @@ def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = (
             raise UsageError(f"{path} is not the name of a {noun}; end it in {ending}")
         check_writable(path)
         taken.append(resolved)
+
+
+def check_used(graph: Graph, given: Mapping[str, Sequence[str]]) -> None:
+    """Refuse options of an output that no sink of the pipeline writes. given: ending of the output -> its options."""
+    endings = {sink.suffix for _, sink in graph.sinks}
+    for ending, options in given.items():
+        if options and endings <= given.keys() - {ending}:
+            raise UsageError(f"the pipeline has no sink that writes {ending} files; leave out {' and '.join(options)}")

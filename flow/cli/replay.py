@@ -224,7 +224,10 @@ def _outputs(graph: Graph, paths: Mapping[str, Path | None]) -> dict[str, Path]:
             raise UsageError(f"{use} writes {sink.suffix} files, but a run writes only {' and '.join(paths)} files")
         if endings.count(sink.suffix) > 1:
             raise UsageError(f"several sinks write {sink.suffix} files, but a run writes only one; keep one")
-    return {use: path for use, sink in graph.sinks if (path := paths[sink.suffix]) is not None}
+    used = {use: path for use, sink in graph.sinks if (path := paths[sink.suffix]) is not None}
+    if not used:
+        raise UsageError(f"the pipeline writes only {' and '.join(endings)} files, and the run is to write none")
+    return used
 
 
 def as_json(summary: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from flow.cli.arguments import count, memory, workers
-from flow.cli.outputs import add_pipeline_options
+from flow.cli.outputs import add_pipeline_options, check_used
 from flow.cli.report import say
 from flow.contracts import counted
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> int:
         raise UsageError("give logs, folders, glob patterns or a text file that lists them")
     if options.out.is_file():
         raise UsageError(f"{options.out} is a file; give the name of a folder")
-    load(options.pipeline, options.set)
+    check_used(load(options.pipeline, options.set), {".mcap": [], ".rrd": ["--rrd"] if options.rrd else []})
     pipeline, folder = Pipeline.of(options.pipeline, tuple(options.set)), options.out.absolute()
     jobs = jobs_of(options.logs, folder, Catalogue(folder).rows() if (folder / NAME).is_file() else ())
     with writing(options.out):

@@ -11,7 +11,7 @@ from typing import Any
 
 from flow.cli.arguments import every, rate, seconds, workers
 from flow.cli.checkpoint_file import checkpoint_of
-from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, default_result, write_text
+from flow.cli.outputs import add_log, add_pipeline_options, check_outputs, check_used, default_result, write_text
 from flow.cli.replay import as_json, replay
 from flow.cli.report import exit_code, headline, report, say
 from flow.cli.watching import watched
@@ -21,6 +21,7 @@ from recordings.errors import UnwritableError
 from recordings.sinks import DESKS
 
 HELP = "replay a log through a pipeline"
+OF_OUTPUTS = {".mcap": ("out", "profile", "with_inputs"), ".rrd": ("rrd", "desk", "view", "serve")}  # ending -> options
 
 
 def add_arguments(sub: argparse.ArgumentParser) -> None:
@@ -70,7 +71,7 @@ def add_arguments(sub: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Run the pipeline, print the verdict and write the summary."""
-    from flow.config.loader import pipeline_file
+    from flow.config.loader import load, pipeline_file
 
     find_files(options.log)  # refuses a wrong name at once
     pipeline_file(options.pipeline)
@@ -80,6 +81,11 @@ def run(options: argparse.Namespace) -> int:
     check_outputs(outputs, [*options.log, Path(options.pipeline)])
     if rrd is None and (options.view or options.serve or options.desk):
         raise UsageError("--view, --serve and --desk need the recording; leave out --no-rrd")
+    given = {
+        ending: [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]
+        for ending, names in OF_OUTPUTS.items()
+    }
+    check_used(load(options.pipeline, options.set), given)
     names = ("workers", "start", "end", "every", "rate", "profile", "desk", "with_inputs", "resume")
     settings: dict[str, Any] = {name: getattr(options, name) for name in names}
     try:
