@@ -12,7 +12,7 @@ import pytest
 from flow.cli import watching
 from recordings import RerunSink
 from tests.conftest import SMALL, roverflow
-from tests.recordings.sinks.recorded_scene import START, STREAMS, Record, pictures, rows, scene
+from tests.recordings.sinks.recorded_scene import START, STREAMS, Record, pictures, record_of, rows, scene
 from tests.viewers import answers, send, viewer, wait_for, wait_for_bytes
 
 FRAME_BYTES = 100_000  # fewer than a frame of the traverse has in the recording
@@ -100,6 +100,25 @@ def test_a_served_run_writes_the_same_result_and_its_page_ends(traverse, result,
     assert "watch the run at http://127.0.0.1:" in said(0, "run", traverse, *SMALL, "-o", out, "--serve").out
     check_same(out, result)
     assert not answers(port_of(started[0]))
+
+
+def test_the_page_of_a_killed_run_ends(tmp_path):
+    seen = record_of(tmp_path / "seen.rrd", [Record(START, scene())])
+    run = f"""
+import os, pathlib, time
+from flow.cli.watching import watched
+with watched(False, True, None) as pipe:
+    os.write(pipe, pathlib.Path({str(seen)!r}).read_bytes())
+    time.sleep(100)
+"""
+    with subprocess.Popen([sys.executable, "-c", run], stdout=subprocess.PIPE, text=True) as killed:
+        assert killed.stdout is not None
+        try:
+            port = int(killed.stdout.readline().partition("rerun+http://127.0.0.1:")[2].partition("/")[0])
+            wait_for(lambda: answers(port), "the server does not answer")
+        finally:
+            killed.kill()
+    wait_for(lambda: not answers(port), "the server is still there")
 
 
 @pytest.mark.slow

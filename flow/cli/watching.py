@@ -21,6 +21,14 @@ from flow.errors import UsageError
 
 PORT, WEB_PORT = 9877, 9090  # the first ones tried, on loopback; the viewer itself listens on 9876
 LIVE_MEMORY = "512MB"  # of what a browser that comes later still gets; beyond it the oldest is dropped
+# Starts a command, and ends all of its group once no process holds the other end of a pipe, even after a kill.
+GUARD = """
+import os, subprocess, sys
+subprocess.Popen(sys.argv[2:])
+os.close(0)
+os.read(int(sys.argv[1]), 1)
+os.killpg(0, 9)
+"""
 
 
 @contextmanager
@@ -36,13 +44,15 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
     port, web = _free(PORT), _free(WEB_PORT)
     page = ["--serve-web", "--web-viewer-port", str(web), "--server-memory-limit", LIVE_MEMORY]
     words = ["--bind", "127.0.0.1", *([*page, "--port", str(port)] if serve else ["--port", "auto"])]
-    reading, writing = os.pipe()
+    (reading, writing), (lifeline, held) = os.pipe(), os.pipe()
+    guard = [sys.executable, "-Ic", GUARD, str(lifeline)] if serve else []
     process = subprocess.Popen(
-        [sys.executable, "-m", "rerun", *words, "-"],
-        stdin=reading, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        [*guard, sys.executable, "-m", "rerun", *words, "-"],
+        stdin=reading, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, pass_fds=(lifeline,),
         start_new_session=True,  # Ctrl-C is for the run; its processes are one group
     )  # fmt: skip
     os.close(reading)
+    os.close(lifeline)
 
     def report_failure() -> None:
         if process.wait() > 0:
@@ -57,6 +67,7 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
         yield writing
     finally:
         os.close(writing)
+        os.close(held)
         if serve:  # it has started another process, and neither ends by itself while it is suspended
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
