@@ -49,10 +49,12 @@ def port_of(server):
 
 def test_a_viewer_that_never_opens_changes_nothing(traverse, result, tmp_path, said, monkeypatch):
     replaced(monkeypatch, lambda command: [sys.executable, "-c", "raise SystemExit(1)"])
-    out = tmp_path / "out.mcap"
+    out = tmp_path / "my out.mcap"
     printed = said(0, "run", traverse, *SMALL, "-o", out, "--view").out
-    assert f"No viewer opens (no display?). The run goes on; afterwards: rerun {tmp_path / 'out.rrd'}" in printed
+    assert f"No viewer opens (no display?). The run goes on; afterwards: rerun '{tmp_path / 'my out.rrd'}'" in printed
     check_same(out, result)
+    made = said(0, "desk", out.with_suffix(".rrd"), "--desk", "tilt").out
+    assert made.endswith(f"; rerun '{tmp_path / 'my out.rrd'}' '{tmp_path / 'my out-tilt.rbl'}' shows it\n")
 
 
 @pytest.mark.parametrize("serve", [False, True])

@@ -7,6 +7,7 @@ only its own picture: the run waits for it at its end, for 3 s at most.
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -56,7 +57,7 @@ def watched(view: bool, serve: bool, recording: Path | None) -> Iterator[int]:
 
     def report_failure() -> None:
         if process.wait() > 0:
-            say(f"No viewer opens (no display?). The run goes on; afterwards: rerun {recording}")
+            say(f"No viewer opens (no display?). The run goes on; afterwards: rerun {shlex.quote(str(recording))}")
 
     reporter = threading.Thread(target=report_failure, name="viewer", daemon=True)
     if serve:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 
 from flow.cli.outputs import check_outputs
@@ -39,5 +40,5 @@ def run(options: argparse.Namespace) -> int:
             if room_to_grow(temporary) < MAX_LAYOUT_BYTES:  # rerun's writer never returns from a full disk
                 raise unwritable(path, f"less than {MAX_LAYOUT_BYTES >> 20} MB more can be written there")
             layout.blueprint(name).save(APPLICATION, str(temporary))
-        say(f"wrote {path}; rerun {options.recording} {path} shows it")
+        say(f"wrote {path}; {shlex.join(['rerun', str(options.recording), str(path)])} shows it")
     return COMPLETE
