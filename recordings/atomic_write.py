@@ -5,6 +5,7 @@ Each writer has a temporary name of its own, so two writers of one path do not m
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -72,7 +73,8 @@ def writing(path: Path) -> Iterator[None]:
 
 def unwritable(path: Path, reason: str, kept: str = "") -> UnwritableError:
     """The error for a file that cannot be written. kept: a note about what was kept."""
-    remedy = "choose another folder for the output or free disk space"
+    too_long = reason == os.strerror(errno.ENAMETOOLONG)
+    remedy = "choose a shorter name" if too_long else "choose another folder for the output or free disk space"
     return UnwritableError(f"cannot write {path}: {reason}{kept}; {remedy}")
 
 

@@ -237,6 +237,11 @@ def test_every_command_reports_an_unwritable_path_alike(traverse, result, tmp_pa
         assert printed.count("\n") == 1
 
 
+def test_the_remedy_for_a_long_name_is_a_shorter_one(traverse, tmp_path, said):
+    printed = said(1, "run", traverse, *SMALL, "-o", tmp_path / f"{'a' * 250}.mcap", "--no-rrd")[1]
+    assert "File name too long; choose a shorter name\n" in printed
+
+
 def test_a_full_disk_is_reported_in_one_sentence():
     """A disk that is full where the drawing of a graph is sent to."""
     code = "import sys; from flow.cli.main import main; sys.exit(main(['graph']))"

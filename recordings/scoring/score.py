@@ -36,7 +36,15 @@ from recordings.scoring.contents import (
 )  # fmt: skip
 from recordings.scoring.metrics import angle_between
 from recordings.scoring.pose_metrics import PoseTally
-from recordings.scoring.result_log import about_run, is_input, part_run, span_run, stamps_run, without_results
+from recordings.scoring.result_log import (
+    about_run,
+    check_profile,
+    is_input,
+    part_run,
+    span_run,
+    stamps_run,
+    without_results,
+)
 from recordings.scoring.side_by_side import Messages, frames
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
@@ -135,6 +143,7 @@ def score(result: Path, truth: Path | Sequence[Path], whole: bool = True) -> Sco
     """
     result, files = Path(result), [Path(truth)] if isinstance(truth, Path | str) else [*map(Path, truth)]
     name = ", ".join(map(str, files))
+    check_profile(result, about_run(result))
     with McapFile(result), open_recording(files) as log:
         # without topics that have no message, unless messages were lost
         topics = {channel.topic for n, channel in log.channels.items() if log.count({n}) or log.lost}

@@ -7,6 +7,7 @@ and the ledger below. A layout is made from the entities that were really logged
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -103,12 +104,13 @@ def read_layout(recording: Path) -> Layout:
     """The layout that a recording of `RerunSink` keeps. Raises LogError."""
     first_bytes(recording, "a recording")  # refuses what is no file, or empty
     try:
-        for chunk in rr.chunk.RrdReader(str(recording)).stream():
-            if chunk.entity_path == f"/{LAYOUT}":
-                (text,) = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1]
-                found = json.loads(text)
-                views = tuple(ViewSpec(Panel[panel], *rest) for panel, *rest in found["views"])
-                return Layout(views, tuple(found["slowest"]))
+        with warnings.catch_warnings(action="ignore"):  # of a recording without its end
+            for chunk in rr.chunk.RrdReader(str(recording)).stream():
+                if chunk.entity_path == f"/{LAYOUT}":
+                    (text,) = chunk.to_record_batch().column("TextDocument:text").to_pylist()[-1]
+                    found = json.loads(text)
+                    views = tuple(ViewSpec(Panel[panel], *rest) for panel, *rest in found["views"])
+                    return Layout(views, tuple(found["slowest"]))
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise LogError(f"cannot read {recording} as a recording: {error}; run the log again") from error
     raise LogError(f"{recording} keeps no layout: its run was cut short, or another program made it; run the log again")

@@ -64,6 +64,16 @@ def test_a_plot_of_many_lines_has_no_legend():
         assert [plot.name.endswith("hover for names") for plot in plots] == [stages == 25] * 2
 
 
+def test_a_recording_that_was_cut_is_refused_in_one_sentence(rrd, tmp_path, recwarn):
+    cut = tmp_path / "cut.rrd"
+    cut.write_bytes(rrd.read_bytes()[:5000])
+    with pytest.raises(
+        LogError, match=r"cannot read .*cut\.rrd as a recording: Failed to read RRD file at .*; run the log"
+    ):
+        read_layout(cut)
+    assert not recwarn
+
+
 def test_the_names_of_curves_stand_beside_a_plot_and_hide_none(rrd):
     layout = read_layout(rrd)
     for desk in ("overview", "tilt"):

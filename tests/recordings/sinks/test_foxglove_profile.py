@@ -84,7 +84,8 @@ def test_cells_transforms_and_losses_are_those_of_the_ros_messages(messages, ros
 
 def test_it_is_replaced_by_the_next_run_and_refused_by_readers_of_ros_messages(foxglove, traverse, result, capsys):
     assert is_ours(foxglove, "result log")
-    for command in (["score", foxglove, "--truth", traverse], ["diff", foxglove, result], ["report", foxglove]):
+    scoring = (["score", foxglove], ["score", foxglove, "--truth", traverse])
+    for command in (*scoring, ["diff", foxglove, result], ["report", foxglove]):
         assert roverflow(*command) == 2, command
         assert "--profile ros2" in capsys.readouterr().err
 
