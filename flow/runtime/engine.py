@@ -286,8 +286,9 @@ class Engine:
             value = Absent(entry)
         if work.output:
             frame.values[work.output] = value
-        for stream, why in value.items() if work.output is None and isinstance(value, Mapping) else ():
-            self._ledger.add(Loss(stream, frame.stamp, work.name, LossReason.UNWRITABLE, why))
+        elif isinstance(value, Mapping):
+            for stream, why in value.items():
+                self._ledger.add(Loss(stream, frame.stamp, work.name, LossReason.UNWRITABLE, why))
         self._complete(work, frame)
         if isinstance(value, NO_ITEM):
             self._pass_absence(frame)

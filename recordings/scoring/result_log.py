@@ -82,8 +82,10 @@ def names_of(logs: Sequence[Path]) -> str:
 
 
 def is_input(about: Mapping[str, str], logs: Sequence[Path]) -> bool:
-    """Whether a log, its files or its folder, has the bytes of the input of a run. about: the facts of the run."""
-    return about.get("log_digest") == log_digest(find_files(logs).files)
+    """Whether a log, its files in any order or its folder, has the bytes of the input of a run. about: its facts."""
+    files, names = find_files(logs).files, about.get("log", "").split(", ")
+    in_order = sorted(files, key=lambda file: names.index(file.name) if file.name in names else len(names))
+    return about.get("log_digest") in {log_digest(files), log_digest(in_order)}
 
 
 def part_run(result: Path, logs: Sequence[Path]) -> tuple[float | None, float | None]:

@@ -48,6 +48,7 @@ from recordings.scoring.result_log import (
 from recordings.scoring.side_by_side import Messages, frames
 from recordings.scoring.stereo_metrics import StereoErrors, cropped_columns
 from recordings.scoring.terrain_metrics import TerrainTally, TrueGround
+from recordings.source.topics import attempt
 from stages.data import LEVEL_FRAME, Cell
 
 RESULTS = ("/nav/disparity", "/nav/elevation_map", "/nav/navigation_map")
@@ -196,11 +197,11 @@ class _Tally:
     def noted(self, messages: Messages) -> Messages:
         """The truth's messages but transforms; notes mounts, and stamps outside the part of the log that was run."""
         for topic, time, message in messages:
-            if topic == "/tf_static":
-                self.mounts |= {item.child_frame_id: item for item in message.transforms}
-            for item in message.transforms if topic in ("/tf", "/tf_static") else ():
-                self._note_distances(item)
             if topic in ("/tf", "/tf_static"):
+                if topic == "/tf_static":
+                    self.mounts |= {item.child_frame_id: item for item in message.transforms}
+                for item in message.transforms:
+                    self._note_distances(item)
                 continue
             stamp = ros2.stamp_of(message.header)
             left_out = self.taken is not None and stamp not in self.taken
@@ -212,13 +213,13 @@ class _Tally:
 
     def _note_distances(self, item: Any) -> None:
         """Note how far cameras are from base_link by a transform of its child, such as a mast that turns."""
-        if item.header.frame_id != "base_link":
+        above = attempt(ros2.transform_of, item)
+        if isinstance(above, LogError) or above.parent != "base_link":
             return
-        turn, shift = rotation_of(item.transform.rotation), place_of(item.transform.translation)
-        found = {item.child_frame_id: float(np.linalg.norm(shift))}
+        found = {above.child: float(np.linalg.norm(above.translation))}
         for name, mount in self.mounts.items():
-            if mount.header.frame_id == item.child_frame_id:
-                found[name] = float(np.linalg.norm(turn @ place_of(mount.transform.translation) + shift))
+            if mount.header.frame_id == above.child:
+                found[name] = float(np.linalg.norm(above(place_of(mount.transform.translation))))
         for name, distance in found.items():
             low, high = self.distances.get(name, (distance, distance))
             self.distances[name] = min(low, distance), max(high, distance)

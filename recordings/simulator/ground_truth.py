@@ -2,8 +2,8 @@
 
 Disparity comes from the rays of the left image. Elevation and hazards come from vertical rays onto the cell centres, in
 the level frame of the true tilt. The region is what is within 8 m of base_link, horizontally, or of the left camera. A
-cell is in view if a line of sight from each camera reaches any of nine points of
-its surface, whether or not a pixel is on that line: a map may have values between pixels, but not behind an obstacle.
+cell is in view if a line of sight from each camera reaches any of nine points of its surface, whether or not a pixel is
+on that line: a map may have values between pixels, but not behind an obstacle.
 """
 
 from __future__ import annotations

@@ -39,7 +39,8 @@ class MovingMount:
     """The mount of a camera on the rover, while `samples` has its transforms.
 
     inclinometer, base: their frames; static: the transforms that do not move; links: those that do; topics: theirs;
-    joints: by name; lost: transform -> stamps, ns, of the frames that lack it.
+    joints: by name; begun: transform -> its earliest stamp, ns; lost: transform -> stamps, ns, of the frames that lack
+    it.
     """
 
     camera: Camera
@@ -50,6 +51,7 @@ class MovingMount:
     topics: Sequence[str]
     joints: Mapping[str, Joint]
     samples: dict[Link, list[tuple[int, Transform]]] = field(init=False)
+    begun: dict[Link, int] = field(init=False, default_factory=dict)
     lost: dict[Link, list[int]] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -68,6 +70,7 @@ class MovingMount:
     def add(self, message: Any, log_time: int) -> None:
         """Add the transforms of a tf2_msgs/TFMessage or a sensor_msgs/JointState."""
         for link, stamp, transform in _transforms_in(message, log_time, self.joints, self.samples):
+            self.begun[link] = min(stamp, self.begun.get(link, stamp))
             insort(self.samples[link], (stamp, transform), key=itemgetter(0))
             del self.samples[link][:-MAX_SAMPLES]
 
@@ -97,12 +100,12 @@ class MovingMount:
         samples = self.samples[link]
         if not samples:
             return "has no message that can be read"
-        ahead = max(samples[0][0] - stamps[-1], stamps[0] - samples[-1][0])
-        if ahead > MAX_CLOCK_NS:
-            return (
-                f"has stamps of another clock, {ahead / 1e9:.1f} s off those of the images; record both with one clock"
-            )
-        if not any(isinstance(attempt(_interpolated, link, samples, stamp), LogError) for stamp in stamps):
+        apart = max(self.begun[link] - stamps[-1], stamps[0] - samples[-1][0])
+        if apart > MAX_CLOCK_NS:
+            off = f"{apart / 1e9:.1f} s off those of the images"
+            return f"has stamps of another clock, {off}; record both with one clock"
+        kept = [attempt(_interpolated, link, samples, stamp) for stamp in stamps if stamp >= samples[0][0]]
+        if kept and not any(isinstance(each, LogError) for each in kept):
             return "is logged too late"
         return "has a gap"
 
@@ -122,7 +125,8 @@ class MovingMount:
 class MovingTransforms:
     """The transforms of a log that may move, as found in samples of each topic.
 
-    messages: topic -> those messages; links: topic -> its transforms; joints: by name.
+    messages: topic -> those messages; links: topic -> its transforms; joints: those of which the log has angles, by
+    name; they win over transforms.
     """
 
     messages: Mapping[str, Sequence[Any]]
@@ -133,21 +137,22 @@ class MovingTransforms:
     def of(cls, topics: DecodedTopics, joints: Mapping[str, Joint], most: int | None) -> MovingTransforms:
         """Those of a log. joints: of the source, without which angles of joints are not read; most: messages of each
         part of the log."""
-        found = dict[str, list[Any]]()
+        messages, links = dict[str, list[Any]](), dict[str, set[Link]]()
         for topic, schema in sorted(topics.schemas.items()):
             if (schema == TRANSFORMS and not topic.endswith("tf_static")) or (schema == JOINTS and joints):
-                read = topics.sample(topic, lambda message: message, most)
-                found[topic] = [message for message in read if not isinstance(message, LogError)]
-        links = {
-            topic: {link for each in messages for link in _links_in(each, joints)} for topic, messages in found.items()
-        }
-        return cls(found, links, joints)
+                read = topics.sample(topic, lambda message: (message, _links_in(message, joints)), most)
+                found = [each for each in read if not isinstance(each, LogError)]
+                messages[topic] = [message for message, _ in found]
+                links[topic] = {link for _, each in found for link in each}
+        turned = set[Link]().union(*(links[topic] for topic in links if topics.schemas[topic] == JOINTS))
+        for topic in links:
+            links[topic] -= turned if topics.schemas[topic] == TRANSFORMS else set()
+        return cls(messages, links, {name: joint for name, joint in joints.items() if _link_of(joint) in turned})
 
     @property
     def of_joints(self) -> set[Link]:
-        """The transforms by joints of which the log has angles."""
-        turned = {(joint.origin.parent, joint.origin.child) for joint in self.joints.values()}
-        return turned & set().union(*self.links.values())
+        """The transforms by joints."""
+        return {_link_of(joint) for joint in self.joints.values()}
 
     def tree(self, static: TransformTree, without: str = "") -> TransformTree:
         """Static transforms and those that move, at unknown places. without: a frame that none of them places."""
@@ -163,9 +168,10 @@ class MovingTransforms:
         found = dict[Link, LogError]()
         for topic, messages in self.messages.items():
             for item in chain.from_iterable(getattr(message, "transforms", ()) for message in messages):
-                link = (frame_of(item), frame_name(item.child_frame_id))
-                wrong = attempt(static.add, item) if frozenset(link) in still and link not in found else None
-                if isinstance(wrong, LogError):
+                link, transform = (frame_of(item), frame_name(item.child_frame_id)), attempt(transform_of, item)
+                if frozenset(link) not in still or link in found or isinstance(transform, LogError):
+                    continue
+                if isinstance(wrong := attempt(static.join, transform), LogError):
                     found[link] = LogError(f"{topic}: {wrong}")
         return [*found.values()]
 
@@ -189,8 +195,11 @@ def _links_in(message: Any, joints: Mapping[str, Joint]) -> list[Link]:
     """The transforms that a message has."""
     if hasattr(message, "transforms"):
         return [(frame_of(item), frame_name(item.child_frame_id)) for item in message.transforms]
-    origins = (joints[name].origin for name in message.name if name in joints)
-    return [(origin.parent, origin.child) for origin in origins]
+    return [_link_of(joints[name]) for name, _ in zip(message.name, message.position, strict=False) if name in joints]
+
+
+def _link_of(joint: Joint) -> Link:
+    return joint.origin.parent, joint.origin.child
 
 
 def _transforms_in(
@@ -198,12 +207,13 @@ def _transforms_in(
 ) -> Iterator[tuple[Link, int, Transform]]:
     """The wanted transforms of a message, with their stamps."""
     if hasattr(message, "transforms"):
+        turned = {*map(_link_of, joints.values())}
         for link, item in zip(_links_in(message, joints), message.transforms, strict=True):
-            if link in wanted:
+            if link in wanted and link not in turned:
                 yield link, stamp_or(item.header, log_time), transform_of(item)
         return
     for name, angle in zip(message.name, message.position, strict=False):
-        if name in joints and (link := (joints[name].origin.parent, joints[name].origin.child)) in wanted:
+        if name in joints and (link := _link_of(joints[name])) in wanted:
             if not np.isfinite(angle):
                 raise LogError(f"the angle of joint '{name}' is {angle}")
             yield link, stamp_or(message.header, log_time), joints[name].at(float(angle))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from operator import itemgetter
 from typing import Any
 
@@ -258,15 +258,16 @@ class SourceResolution:
         if base == type(self.source).base_frame or self.mount is None:
             return
         said = f"the source's 'base_frame' is set to '{base}', but "
-        others, posed = self._rover_frames(), self._posed_frame()
+        others = self._rover_frames()
         if self.mount.base_from_camera is None and others:
             self.refused["base_frame"] = (
                 f"{said}transforms join the camera to {others} only; set it to one of these, or record its transform "
                 "to the camera"
             )
-        if self.mount.base_from_camera is None or not posed or self.static.between(posed, base) is not None:
-            return
-        if self.moves.tree(self.static).between(posed, base) is not None:
+        assert self.cameras is not None  # a mount needs them
+        fixed, posed = self._posed_frames()
+        path = self.moves.tree(self.static).path(posed, self.cameras[0].frame_id)
+        if base in path and not any(map(fixed, path)) and self.static.between(posed, base) is None:
             why = f"this frame moves on '{posed}', whose poses {self.chosen['odometry']} contains"
             self.refused["base_frame"] = f"{said}{why}; set it to '{posed}'"
 
@@ -285,16 +286,19 @@ class SourceResolution:
         assert self.cameras is not None  # a mount needs them
         own = {self.tilt_frame, *(camera.frame_id for camera in self.cameras)}
         tree, camera = self.moves.tree(self.static), self.cameras[0].frame_id
-        joined = {name for name in tree.edges if tree.between(name, camera) is not None} - own - _FIXED_FRAMES
-        posed = self._posed_frame()
+        fixed, posed = self._posed_frames()
+        joined = {name for name in tree.edges if tree.between(name, camera) is not None and not fixed(name)} - own
         return ", ".join(f"'{name}'" for name in ([posed] if posed in joined else sorted(joined)))
 
-    def _posed_frame(self) -> str:
-        """The frame whose poses the log has; empty if there is none."""
-        if "odometry" not in self.chosen:
-            return ""
-        pose = self.messages.first(self.chosen["odometry"], lambda message: _pose_of(message, self.source.base_frame))
-        return "" if isinstance(pose, LogError) else pose.child_frame_id
+    def _posed_frames(self) -> tuple[Callable[[str], bool], str]:
+        """Whether a frame does not move, by its name or because the poses are in it; and the frame whose poses the log
+        has, empty if there is none."""
+        topic, parent, child = self.chosen.get("odometry"), "", ""
+        if topic is not None:
+            pose = self.messages.first(topic, lambda message: _pose_of(message, self.source.base_frame))
+            if not isinstance(pose, LogError):
+                parent, child = pose.frame_id, pose.child_frame_id
+        return lambda name: name == parent or name.rpartition("/")[2] in _FIXED_FRAMES, child
 
     def _resolve_pose(self) -> None:
         """Whether the poses can be used: in a fixed frame, of a frame that is joined to the camera."""

@@ -118,20 +118,20 @@ class TransformTree:
 
     def joined(self, transforms: Iterable[Transform]) -> TransformTree:
         """This tree with further transforms, which win where they differ."""
-        tree = TransformTree({frame: dict(edges) for frame, edges in self.edges.items()}, dict(self.parents))
+        edges = {frame: dict(edges) for frame, edges in self.edges.items()}
+        tree = TransformTree(edges, dict(self.parents), set(self.calibrated))
         for transform in transforms:
             tree.edges.setdefault(transform.parent, {})[transform.child] = transform
             tree.edges.setdefault(transform.child, {})[transform.parent] = transform.inverse()
         return tree
 
     def without(self, links: Iterable[tuple[str, str]]) -> TransformTree:
-        """This tree without the transforms of these parents and children."""
+        """This tree without what joins these parents and children directly, or these children to another parent."""
         tree = self.joined(())
         for parent, child in links:
-            if tree.edges.get(parent, {}).pop(child, None) is not None:
-                del tree.edges[child][parent]
-                if tree.parents.get(child) == parent:
-                    del tree.parents[child]
+            for one, other in ((parent, child), (child, parent), (tree.parents.get(child, ""), child)):
+                if tree.parents.get(other) == one:
+                    del tree.parents[other], tree.edges[one][other], tree.edges[other][one]
         return tree
 
     def listed(self) -> list[str]:

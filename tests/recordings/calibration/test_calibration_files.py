@@ -14,7 +14,7 @@ from recordings import McapSource
 from recordings.calibration.formats import StereoCalibration, read_calibration
 from recordings.calibration.yaml_files import read_yaml
 from recordings.errors import LogError
-from tests.conftest import data_folder
+from tests.conftest import data_folder, mcap_rows, write_mcap
 from tests.recordings.calibration.euroc_bag import euroc_bag, euroc_rosbag2, kalibr_camchain
 from tests.recordings.sample_log import (
     HEIGHT,
@@ -226,9 +226,13 @@ def test_a_tilt_without_a_frame_has_the_mount_of_the_calibration(tmp_path):
     (TRANSFORMS, 0), (TRANSFORMS[1:], 0), ((*TRANSFORMS, replace(TRANSFORMS[0], translation=np.zeros(3))), 1),
 ], ids=["camera and Imu", "Imu", "two places of the camera"])  # fmt: skip
 def test_transforms_of_a_calibration_win_over_those_of_the_log(tmp_path, nominal, contradictions):
-    log = write_sample(tmp_path / "log.mcap", mounted(*nominal))
+    """Also over those on /tf, which here repeats /tf_static."""
+    rows = mcap_rows(write_sample(tmp_path / "log.mcap", mounted(*nominal)))
+    log = write_mcap(tmp_path / "tf.mcap", rows + [("/tf", *row[1:]) for row in rows if row[0] == "/tf_static"])
     with McapSource(calibration=kalibr_of_sample(tmp_path)).open(log) as opened:
-        assert len(opened.resolution.problems) == contradictions
+        problems = [str(problem) for _, problem in opened.resolution.problems]
+        assert sum(problem.startswith("/tf_static: ") for problem in problems) == contradictions
+        assert sum(problem.startswith("/tf: ") for problem in problems) <= contradictions
         camera_from_imu = opened.resolution.static.between("left_optical", "imu_link")
         assert camera_from_imu is not None
         np.testing.assert_allclose(camera_from_imu.rotation, CAMERA_FROM_IMU[:3, :3], atol=1e-9)

@@ -205,8 +205,10 @@ def test_the_origin_of_maps_is_checked_under_a_mast_that_turns(scored, tmp_path,
 
     mast = Transform("base_link", "mast", np.eye(3), np.zeros(3))
     log = rewrite(truth, tmp_path / "mast.mcap", edit_of("/tf_static", "tf2_msgs/msg/TFMessage", onto_mast))
+    transforms = ros2.transform_message([(replace(mast, child="wheel"), SMALL.stamp(0)), (mast, SMALL.stamp(0))])
+    transforms.transforms[0].transform.rotation.w = 0.0  # of a body that is not the camera's
     with Ros2Writer(tmp_path / "tf.mcap") as writer:
-        writer.write("/tf", ros2.transform_message([(mast, SMALL.stamp(0))]), SMALL.stamp(0))
+        writer.write("/tf", transforms, SMALL.stamp(0))
     found = scoring.score(Run(lower=lower).write(tmp_path / "out.mcap"), [log, tmp_path / "tf.mcap"])
     assert ("/nav/elevation_map" in found.unscored) == (lower > 0)
 

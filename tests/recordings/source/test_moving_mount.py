@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from recordings import McapSource
 from recordings.ros2.cdr import make
 from recordings.ros2.to_msg import header, imu, odometry, transform_message
 from stages.data import CameraImage, Mount, Pose, Transform
-from tests.conftest import write_messages
+from tests.conftest import mcap_rows, write_mcap, write_messages
 from tests.recordings.sample_log import START, TRANSFORMS, missing_in, refused_in, stereo_rows
 
 MS = 1_000_000
@@ -207,6 +208,46 @@ def test_the_suggested_base_frame_is_that_of_the_poses(tmp_path):
     assert "transforms join the camera to 'body' only" in refused_in(log, base_frame="bodi")["base_frame"]
 
 
+def test_a_frame_of_the_rover_that_moves_may_be_the_base_if_it_is_not_on_the_mast(tmp_path):
+    """A footprint above the frame of the poses; a body beside it in a fixed frame."""
+
+    def with_footprint(stamp):
+        rolled = Transform("base_footprint", "base_link", pan(stamp).rotation, [0.0, 0.0, 0.1])
+        rover = Transform("odom", "base_footprint", np.eye(3), np.zeros(3))
+        return {"/tf": transform_message([(rover, stamp), (rolled, stamp)])}
+
+    def of_two_bodies(stamp):
+        bodies = [Transform("odom", name, pan(stamp).rotation, np.ones(3)) for name in ("base_link", "chassis")]
+        return {"/tf": transform_message([(body, stamp) for body in bodies])}
+
+    on_chassis = tuple(replace(each, parent="chassis") for each in TRANSFORMS)
+    for messages, static, base in (
+        (with_footprint, TRANSFORMS, "base_footprint"), (of_two_bodies, on_chassis, "chassis"),
+    ):  # fmt: skip
+        log = written(tmp_path / f"{base}.mcap", messages, static)
+        assert refused_in(log, base_frame=base) == {}
+
+
+def test_a_long_log_has_no_other_clock(tmp_path, monkeypatch):
+    """Although the first samples are forgotten by its end."""
+    monkeypatch.setattr("recordings.source.moving_mount.MAX_SAMPLES", 45)
+    monkeypatch.setattr("recordings.source.moving_mount.MAX_CLOCK_NS", PERIOD)
+    late = written(tmp_path / "log.mcap", lambda stamp: {} if stamp < START + 100 * MS else joints(stamp))
+    with McapSource().open(late) as log:
+        assert sum(isinstance(item, Exception) for _, _, item in log.events()) == 1
+        assert "'base_link' <- 'mast' has a gap: 1 frame from " in log.faults()["mount"].sentence
+
+
+def test_a_topic_with_the_name_of_transforms_alone_is_ignored(tmp_path):
+    text = make("std_msgs/msg/String", data="no transform")
+    log = written(tmp_path / "log.mcap", lambda stamp: {"/tf": text}, TRANSFORMS)
+    rows = [
+        (topic, encoding, ("tf2_msgs/msg/TFMessage", *kind[1:]) if topic == "/tf" else kind, time, data)
+        for topic, encoding, kind, time, data in mcap_rows(log)
+    ]
+    assert missing_in(write_mcap(tmp_path / "renamed.mcap", rows)) == {}
+
+
 MAST = """
 pan: {parent: base_link, child: mast, xyz: [0.3, 0, 1.0], axis: [0, 0, 1]}
 other: {parent: base_link, child: arm}
@@ -260,7 +301,7 @@ def test_a_mast_whose_messages_are_all_invalid_is_a_missing_mount(tmp_path):
         return {"/tf": message}
 
     def unmoved(stamp):
-        (message := angles(stamp)["/joints"]).position = np.zeros(0)
+        (message := angles(stamp)["/joints"]).position = np.full(2, np.nan)
         return {"/joints": message}
 
     (file := tmp_path / "mast.yaml").write_text(MAST)
@@ -279,6 +320,27 @@ def test_joints_of_the_source_win_over_a_static_transform(tmp_path):
     assert [mount.base_from_camera.translation[0] for mount in mounts] == pytest.approx(
         [pan(mount.stamp).after(ON_MAST).translation[0] for mount in mounts]
     )
+
+
+def test_joints_win_over_the_transforms_of_their_frames(tmp_path):
+    """Those on /tf, and a static one by way of a third frame. A joint without a position is none."""
+    (file := tmp_path / "mast.yaml").write_text(MAST)
+    around = Transform("base_link", "mount", np.eye(3), np.ones(3)), Transform("mount", "mast", np.eye(3), np.ones(3))
+
+    def both(stamp):
+        return {**angles(stamp), "/tf": transform_message([(replace(pan(stamp), translation=np.full(3, 9.0)), stamp)])}
+
+    for messages, static in ((both, (ON_MAST, IMU)), (angles, (ON_MAST, IMU, *around))):
+        mounts, lost, _ = read(written(tmp_path / "log.mcap", messages, static), McapSource(joints=str(file)))
+        assert (len(mounts), lost) == (FRAMES, [])
+        assert {float(mount.base_from_camera.translation[2].round(6)) for mount in mounts} == {1.0}
+
+    def unmoved(stamp):
+        (message := angles(stamp)["/joints"]).position = np.zeros(0)
+        return {"/joints": message}
+
+    still = written(tmp_path / "still.mcap", unmoved, (ON_MAST, IMU, HELD))
+    assert "has no angles of joints that join the camera and the rover" in refused_in(still, joints=str(file))["joints"]
 
 
 def test_joints_that_the_log_has_no_angles_of_are_refused(tmp_path):
