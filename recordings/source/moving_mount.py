@@ -125,8 +125,8 @@ class MovingMount:
 class MovingTransforms:
     """The transforms of a log that may move, as found in samples of each topic.
 
-    messages: topic -> those messages; links: topic -> its transforms; joints: those of which the log has angles, by
-    name; they win over transforms.
+    messages: topic -> its sampled messages; links: topic -> the transforms in them; joints: name -> joint. Only joints
+    with angles in the log are included. They win over transforms of the same frames.
     """
 
     messages: Mapping[str, Sequence[Any]]
@@ -135,8 +135,7 @@ class MovingTransforms:
 
     @classmethod
     def of(cls, topics: DecodedTopics, joints: Mapping[str, Joint], most: int | None) -> MovingTransforms:
-        """Those of a log. joints: of the source, without which angles of joints are not read; most: messages of each
-        part of the log."""
+        """Sample a log. joints: of the source, by name; most: number of messages of each part of the log."""
         messages, links = dict[str, list[Any]](), dict[str, set[Link]]()
         for topic, schema in sorted(topics.schemas.items()):
             if (schema == TRANSFORMS and not topic.endswith("tf_static")) or (schema == JOINTS and joints):
@@ -151,7 +150,7 @@ class MovingTransforms:
 
     @property
     def of_joints(self) -> set[Link]:
-        """The transforms by joints."""
+        """The transforms that joints turn."""
         return {_link_of(joint) for joint in self.joints.values()}
 
     def tree(self, static: TransformTree, without: str = "") -> TransformTree:
@@ -179,8 +178,10 @@ class MovingTransforms:
 def moving_mount(
     moves: MovingTransforms, camera: Camera, inclinometer: str, base: str, static: TransformTree
 ) -> MovingMount | None:
-    """The mount of a camera that moving transforms join to its inclinometer or to the rover's base, with the first
-    samples. None if static transforms join it to both, or if no transform that moves does."""
+    """The mount of a camera that moving transforms join to its inclinometer or to the rover's base, with the samples.
+
+    None if static transforms join it to both, or if no transform that moves does.
+    """
     needed = _needed(camera.frame_id, inclinometer, base, static, moves)
     if not needed:
         return None
