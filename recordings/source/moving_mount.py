@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from flow.contracts import counted
 from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
 from recordings.ros2.from_msg import frame_name, frame_of, stamp_or, transform_of
@@ -89,10 +88,12 @@ class MovingMount:
         """The transforms that frames lack, and when, in seconds after `begin`, ns; empty if none is lost."""
         found = list[str]()
         for (parent, child), stamps in self.lost.items():
-            first, last = ((stamp - begin) / 1e9 for stamp in (stamps[0], stamps[-1]))
-            lacking = f"{counted(len(stamps), 'frame')} from {first:+.1f} s to {last:+.1f} s"
-            why = self._why_lost((parent, child), stamps)
-            found.append(f"'{parent}' <- '{child}' {why}: {lacking} lack it, and their images are lost")
+            first, last = (f"{(stamp - begin) / 1e9:+.1f} s" for stamp in (stamps[0], stamps[-1]))
+            if len(stamps) > 1:
+                lacking = f"{len(stamps)} frames from {first} to {last} lack it, and their images are lost"
+            else:
+                lacking = f"1 frame at {first} lacks it, and its images are lost"
+            found.append(f"'{parent}' <- '{child}' {self._why_lost((parent, child), stamps)}: {lacking}")
         return "; ".join(found)
 
     def _why_lost(self, link: Link, stamps: Sequence[int]) -> str:
