@@ -79,7 +79,8 @@ def _check_plain(value: Any, known: Field[Any]) -> None:
 
 def _kind_of(known: Field[Any]) -> str:
     """The name of the type of a parameter, without None."""
-    return getattr(known.type, "__name__", str(known.type)).removesuffix(" | None")
+    kind = known.type  # a text in modules with postponed annotations
+    return kind.__name__ if isinstance(kind, type) else str(kind).removesuffix(" | None")
 
 
 class Checked:

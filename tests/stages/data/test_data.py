@@ -92,9 +92,12 @@ def test_small_arrays_are_copied():
 
 @dataclass(frozen=True)
 class Free(Stage):
-    """A stage whose parameter has no range."""
+    """A stage whose parameters have no range, with annotations that are no texts."""
 
     length: float = parameter(1.0, "any length", unit="m")
+    count: int | None = parameter(1, "any number")
+    names: tuple[str, ...] = parameter((), "any names")
+    text: str = parameter("", "any text")
 
 
 TERRAIN = ElevationMap(0, {"elevation": FLAT}, F32(0.1), np.zeros(2), "odom")  # type: ignore[arg-type]
@@ -132,6 +135,9 @@ REFUSALS = [
     ("McapSink.viewers must be true or false, not", ["no", 1], lambda bad: McapSink(viewers=bad)),
     ("McapSource.left must be a text, not 5", [5], lambda bad: McapSource(left=bad)),
     ("Free.length must be a finite number in m, not", WILD, lambda value: Free(length=value)),
+    ("Free.names must be a tuple of texts, not", ["pose", 5, None], lambda bad: Free(names=bad)),
+    ("Free.text must be a text, not", [5, True], lambda bad: Free(text=bad)),
+    ("Free.count must be a whole number, not", [2.5], lambda bad: Free(count=bad)),
     ("Match.p2 must be a finite number, not", WILD, lambda value: Match(p2=value)),
 ]  # fmt: skip
 
