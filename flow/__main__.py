@@ -4,6 +4,6 @@ from __future__ import annotations
 
 import sys
 
-from flow.cli.__main__ import program
+from roverflow import program
 
 sys.exit(program())

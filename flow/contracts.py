@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
@@ -9,6 +11,7 @@ from difflib import get_close_matches
 from enum import StrEnum
 from functools import reduce
 from operator import or_
+from pathlib import PurePath
 from types import UnionType
 from typing import Any, ClassVar, Protocol, Union, get_args, get_origin
 
@@ -220,6 +223,16 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """The end of a sentence about an invalid `name`: the valid name nearest to it, if one is near."""
     close = get_close_matches(name, list(valid), n=1, cutoff=MIN_ALIKE)
     return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def as_text(name: str | PurePath) -> str:
+    """A name as outputs contain it: what is not Unicode, as in a name of another encoding, has escapes."""
+    return str(name).encode("utf-8", "backslashreplace").decode()
+
+
+def remedy_for(package: str) -> str:
+    """How to install a package that the environment of this process lacks."""
+    return f"install it by `{shlex.quote(sys.executable)} -m pip install {package}`"
 
 
 def counted(number: int, what: str, many: str = "") -> str:

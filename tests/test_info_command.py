@@ -1,8 +1,11 @@
 """`roverflow info` through a pipeline."""
 
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -98,6 +101,15 @@ def test_a_pipeline_that_info_writes_names_the_topics_and_the_alternatives(tmp_p
     named = write_sample(tmp_path / "named.mcap", names=("/a/picture", "/b/picture"))
     assert roverflow("info", named, "--write-pipeline", tmp_path / "other.yaml") == 2
     assert "  #   left: /a/picture\n  #   right: /b/picture\n" in (tmp_path / "other.yaml").read_text()
+
+
+def test_a_written_pipeline_is_utf_8_in_any_locale(tmp_path):
+    log, own, written = write_sample(tmp_path / "log.mcap"), tmp_path / "own.yaml", tmp_path / "mine.yaml"
+    own.write_text(f"# Höhe\n{(SHIPPED / 'fast.yaml').read_text()}", encoding="utf-8")
+    command = [sys.executable, "-m", "flow", "info", log, "-p", own, "--write-pipeline", written]
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    subprocess.run(command, cwd=SHIPPED.parents[1], env=environment, check=True, capture_output=True)
+    assert written.read_text(encoding="utf-8").startswith("# Höhe\n")
 
 
 def test_a_written_pipeline_has_its_source_once_whatever_the_comments_in_it(tmp_path, refused):

@@ -12,8 +12,10 @@ import rerun
 
 from flow.cli.commands.demo import check_folder
 from flow.cli.replay import replay
+from flow.config.loader import pipeline_file
 from flow.errors import SinkError, UsageError
 from recordings import RerunSink
+from recordings.scoring.result_log import about_run, pipeline_of
 from recordings.sinks.overwrite import is_ours
 from tests.conftest import SMALL, rewrite, roverflow, write_mcap
 from tests.recordings.importers.middlebury_scene import write_scene
@@ -248,7 +250,7 @@ def test_a_full_disk_is_reported_in_one_sentence():
     with Path("/dev/full").open("w") as full:
         done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert done.returncode == 1
-    assert done.stderr.startswith("roverflow: the output: No space left on device")
+    assert done.stderr.startswith("roverflow: stdout: No space left on device")
 
 
 @pytest.mark.parametrize(("key", "topic", "there"), [
@@ -363,11 +365,20 @@ def test_a_run_of_python_takes_a_number_of_frames(traverse, tmp_path):
     ]
 
 
-def test_a_log_with_an_undecodable_name_is_run(traverse, tmp_path):
-    log = os.fsencode(tmp_path / "Fahrt-") + b"\xfcd.mcap"
+def test_names_of_logs_and_pipelines_need_not_be_unicode(traverse, tmp_path, refused):
+    log, own = (tmp_path / os.fsdecode(name) for name in (b"Fahrt-s\xfcd.mcap", b"s\xfcd.yaml"))
     os.link(traverse, log)
-    assert roverflow("run", os.fsdecode(log), *SMALL, "--end", 0.6, "-o", tmp_path / "out.mcap") == 0
+    own.write_text(pipeline_file("fast").read_text())
+    result = log.with_name(f"{log.stem}-nav.mcap")
+    for stream in (sys.stdout, sys.stderr):  # as the program's start does
+        stream.reconfigure(errors="backslashreplace")
+    assert roverflow("run", log, "-p", own, *SMALL, "--end", 0.6) == 0
     assert not list(tmp_path.glob("*.partial"))
+    assert (about_run(result)["log"], pipeline_of(result)) == ("Fahrt-s\\udcfcd.mcap", "s\\udcfcd")
+    assert roverflow("verify", result) == 0
+    assert roverflow("report", result) == 0
+    assert roverflow("try", log, "--at", 0.5, "-p", own, *SMALL, "--set", "disparity.max_step=0") == 0
+    assert "-nav.rrd, whose name is not Unicode; rename it" in refused("desk", result.with_suffix(".rrd"))
 
 
 def test_a_pipeline_of_nested_aliases_is_refused_at_once(tmp_path, refused):

@@ -30,6 +30,14 @@ def test_a_foreign_module_on_the_path_is_named(tmp_path, name):
     assert done.stderr.count("\n") == 1
 
 
+def test_a_foreign_module_is_named_by_python_m_flow(tmp_path):
+    (tmp_path / "stages.py").touch()
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "flow", "--version"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stderr.partition(" in the way of")[0]) == (2, f"roverflow: {tmp_path}/stages.py is")
+
+
 def test_without_foreign_modules_the_program_starts(tmp_path):
     done = start(tmp_path, ROOT)
     assert (done.returncode, done.stderr) == (0, "")

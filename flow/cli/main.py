@@ -11,6 +11,7 @@ import logging
 import sys
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from types import ModuleType
 from typing import Any, NoReturn
 
@@ -54,13 +55,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return int(options.command(options))
     except (Exception, KeyboardInterrupt) as error:
-        if _interrupted(error):
-            print("roverflow: interrupted", file=sys.stderr)
-            return INTERRUPTED
-        if options.debug:
-            traceback.print_exc()
-        print(f"roverflow: {_sentence(error, options.debug)}", file=sys.stderr)
-        return _exit_code(error)
+        interrupted = _interrupted(error)
+        with suppress(OSError):  # stderr may be full
+            if options.debug and not interrupted:
+                traceback.print_exc()
+            print(f"roverflow: {'interrupted' if interrupted else _sentence(error, options.debug)}", file=sys.stderr)
+        return INTERRUPTED if interrupted else _exit_code(error)
 
 
 def _parsed(given: Sequence[str]) -> argparse.Namespace:

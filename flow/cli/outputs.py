@@ -44,7 +44,7 @@ def write_text(path: Path | None, text: str) -> None:
     if path is None:
         return
     with written(path) as temporary:
-        temporary.write_text(f"{text}\n")
+        temporary.write_text(f"{text}\n", encoding="utf-8")
 
 
 def check_outputs(outputs: Mapping[str, Path | None], inputs: Sequence[Path] = ()) -> None:

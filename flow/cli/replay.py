@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from flow.contracts import Verdict
+from flow.contracts import Verdict, as_text
 from flow.errors import UsageError
 from flow.runtime.frame_selection import Every
 from flow.runtime.graph import Graph
@@ -130,8 +130,7 @@ def _about(
         "every": "" if every is None else str(every),
         **versions(),
     }
-    # A file name may hold bytes that are not UTF-8.
-    return {key: value.encode("utf-8", "replace").decode() for key, value in about.items()}
+    return {key: as_text(value) for key, value in about.items()}
 
 
 @contextmanager

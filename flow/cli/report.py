@@ -24,7 +24,7 @@ def say(text: str) -> None:
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # later prints would fail as well
         if not isinstance(error, BrokenPipeError):
-            raise
+            raise OSError(error.errno, error.strerror, "stdout") from None
 
 
 def duration(seconds: float) -> str:

@@ -18,7 +18,7 @@ from flow.config.node_spec import OWN_PACKAGES, NodeSpec, mapping, place_at_faul
 from flow.config.overrides import Change, with_settings
 from flow.config.templates import SHIPPED, Expansion, Library, Scope, resolved
 from flow.config.yaml_tree import Value, nearest_or_all, read
-from flow.contracts import nearest
+from flow.contracts import as_text, nearest
 from flow.errors import UsageError
 from flow.runtime.graph import (
     Graph,
@@ -71,7 +71,7 @@ def load(name: str | Path, overrides: Iterable[str] = (), with_sinks: bool = Tru
     library = Library(own)
     expansion = Expansion(tree.value["streams"].value, library, changes)
     sinks = tree.value["sinks"].value if with_sinks else []
-    graph = _graph(path.stem, text + library.comments(), tree.value, sinks, expansion)
+    graph = _graph(as_text(path.stem), text + library.comments(), tree.value, sinks, expansion)
     return replace(graph, changes=tuple(overrides))
 
 

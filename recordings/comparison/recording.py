@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from flow.contracts import as_text
 from recordings.atomic_write import written
 from recordings.comparison.diff import MessageDifference
 from recordings.comparison.pages import PAGES, pages
@@ -75,8 +76,8 @@ class DiffRecording:
             stream = rr.RecordingStream("roverflow_diff")
             stream.set_log_time_enabled(False)
             stream.set_sinks(rr.FileSink(str(temporary)))
-            stream.send_recording_name(name)
-            stream.log("tables", rr.TextDocument(tables, media_type=rr.MediaType.MARKDOWN), static=True)
+            stream.send_recording_name(as_text(name))
+            stream.log("tables", rr.TextDocument(as_text(tables), media_type=rr.MediaType.MARKDOWN), static=True)
             if sweep is not None:
                 sweep.log(stream)
             for topic, stamp, sides in pictures:

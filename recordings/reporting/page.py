@@ -59,10 +59,10 @@ def write_page(path: Path, title: str, parts: Sequence[str]) -> None:
     head = [
         f"<!doctype html>\n{REPORT}\n<html lang=en><head><meta charset=utf-8>",
         '<meta name=viewport content="width=device-width, initial-scale=1">',
-        f"<title>{escape(title)}</title><style>{STYLE.read_text()}</style></head><body><h1>{escape(title)}</h1>",
+        f"<title>{escape(title)}</title><style>{STYLE.read_text('utf-8')}</style></head><body><h1>{escape(title)}</h1>",
     ]
     with written(path) as temporary:
-        temporary.write_text("\n".join([*head, *parts, "</body></html>"]), encoding="utf-8")
+        temporary.write_text("\n".join([*head, *parts, "</body></html>"]), encoding="utf-8", errors="backslashreplace")
 
 
 def _section(title: str, content: str) -> str:

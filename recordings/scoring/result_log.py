@@ -16,6 +16,7 @@ from mcap.records import Metadata
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
+from flow.contracts import as_text
 from recordings.containers.digest import log_digest
 from recordings.containers.finding import find_files
 from recordings.containers.opening import open_recording
@@ -71,20 +72,21 @@ def pipeline_of(result: Path) -> str:
 def input_beside(result: Path) -> list[Path]:
     """The input of a run where it would be beside the result log: the file, the files or the folder."""
     named = about_run(result).get("log") or result.name
-    beside = [[result.with_name(name) for name in names] for names in ([named], named.split(", "))]
+    known = {as_text(file.name): file for file in result.parent.glob("*")}
+    beside = [[known.get(name, result.with_name(name)) for name in names] for names in ([named], named.split(", "))]
     return next((files for files in beside if all(file.exists() for file in files)), beside[0])
 
 
 def names_of(logs: Sequence[Path]) -> str:
     """The name of a log of one or several files, as the facts of a run contain it; that of a folder also for "."."""
     names = (Path(os.path.abspath(path)).name for path in dict.fromkeys(logs))  # noqa: PTH100  # keeps links
-    return ", ".join(names).encode("utf-8", "replace").decode()
+    return as_text(", ".join(names))
 
 
 def is_input(about: Mapping[str, str], logs: Sequence[Path]) -> bool:
     """Whether a log, its files in any order or its folder, has the bytes of the input of a run. about: its facts."""
-    files, names = find_files(logs).files, about.get("log", "").split(", ")
-    in_order = sorted(files, key=lambda file: names.index(file.name) if file.name in names else len(names))
+    files, order = find_files(logs).files, {name: at for at, name in enumerate(about.get("log", "").split(", "))}
+    in_order = sorted(files, key=lambda file: order.get(as_text(file.name), len(order)))
     return about.get("log_digest") in {log_digest(files), log_digest(in_order)}
 
 

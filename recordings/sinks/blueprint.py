@@ -111,6 +111,8 @@ def read_layout(recording: Path) -> Layout:
                     found = json.loads(text)
                     views = tuple(ViewSpec(Panel[panel], *rest) for panel, *rest in found["views"])
                     return Layout(views, tuple(found["slowest"]))
+    except UnicodeEncodeError as error:
+        raise LogError(f"rerun does not read {recording}, whose name is not Unicode; rename it") from error
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise LogError(f"cannot read {recording} as a recording: {error}; run the log again") from error
     raise LogError(f"{recording} keeps no layout: its run was cut short, or another program made it; run the log again")

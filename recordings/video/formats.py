@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from importlib.util import find_spec
 
+from flow.contracts import remedy_for
+
 VIDEO_NOTE = "the images are compressed video, whose losses shift disparities by fractions of a pixel"
 VIDEO = "foxglove_msgs/msg/CompressedVideo"
 CODECS = {"h264": "h264", "h265": "hevc"}  # format -> FFmpeg's name of the codec
@@ -19,7 +21,7 @@ def unread_video(video_format: str) -> str:
     if video_format not in CODECS:
         return f"the video format '{video_format}' is not supported; record it in {' or '.join(CODECS)}"
     if find_spec("av") is None:
-        return "compressed video needs PyAV; install it by `pip install '.[video]'` in roverflow's folder"
+        return f"compressed video needs PyAV; {remedy_for('av')}"
     return ""
 
 

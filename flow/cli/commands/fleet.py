@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from flow.cli.arguments import count, memory, workers
 from flow.cli.outputs import add_pipeline_options, check_used
 from flow.cli.report import say
-from flow.contracts import counted
+from flow.contracts import as_text, counted
 from flow.errors import COMPLETE, INCOMPLETE, UsageError
 from recordings.atomic_write import writing
 
@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
 def _run_due(options: argparse.Namespace, jobs: Sequence[Job], pipeline: Pipeline, catalogue: Catalogue) -> None:
     """Say which jobs have to run, and why, and run them."""
     from flow.cli.fleet.engine import Fleet, cluster
-    from flow.cli.fleet.jobs import as_text, reason_to_run
+    from flow.cli.fleet.jobs import reason_to_run
     from flow.cli.fleet.progress import Progress
     from flow.cli.fleet.task import Task
     from flow.cli.replay import product_version

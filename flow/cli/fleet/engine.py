@@ -13,9 +13,9 @@ from typing import Any
 
 from flow.cli.checkpoint_file import remove_checkpoint
 from flow.cli.fleet.catalogue import WAITING, Catalogue
-from flow.cli.fleet.jobs import as_text
 from flow.cli.fleet.progress import Progress, frames_so_far, is_progress
 from flow.cli.fleet.task import Task, about_worker, remove_unfinished, run_task, unfit
+from flow.contracts import as_text, remedy_for
 from flow.errors import INCOMPLETE, RoverflowError, UsageError
 from flow.runtime.interrupts import Stop, interrupts
 
@@ -191,8 +191,7 @@ def cluster(address: str | None, processes: int, cores: int, memory: str, dashbo
 
         from flow.cli.fleet.binding import CoreBinding
     except ImportError as error:
-        remedy = "install it by `pip install '.[fleet]'` in roverflow's folder"
-        raise UsageError(f"a fleet needs dask.distributed; {remedy}") from error
+        raise UsageError(f"a fleet needs dask.distributed; {remedy_for('distributed')}") from error
     for name in [name for name in logging.root.manager.loggerDict if name.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)  # each has a level of its own
     dask.config.set(

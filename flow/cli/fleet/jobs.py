@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from flow.cli.fleet.catalogue import ENDED
+from flow.contracts import as_text
 from flow.errors import UsageError
 from recordings.containers.digest import log_digest
 from recordings.containers.finding import METADATA, RESULT_ENDING, ZSTD_SUFFIXES, find_files, is_log_name
@@ -168,11 +169,6 @@ def _real(path: Path) -> Path:
         return path.resolve(strict=True)
     except (OSError, RuntimeError):  # a loop
         return path
-
-
-def as_text(path: Path) -> str:
-    """A path as the catalogue has it: names that are not Unicode have escapes."""
-    return str(path).encode("utf-8", "backslashreplace").decode()
 
 
 def _job(log: Path, root: Path, name: str | None) -> Job:

@@ -1,5 +1,6 @@
 """Images from compressed video: what is lost, what is not, and where decoding begins."""
 
+import sys
 import tomllib
 from pathlib import Path
 
@@ -75,7 +76,7 @@ def test_key_frames_and_gaps_are_found_in_the_bytes(video):
 def test_video_without_its_library_is_refused_with_the_remedy(sample, tmp_path, monkeypatch):
     log = video_log(sample, tmp_path / "log.mcap", "h264")
     monkeypatch.setattr("recordings.video.formats.find_spec", lambda name: None)
-    remedy = "install it by `pip install '.[video]'` in roverflow's folder"
+    remedy = f"install it by `{sys.executable} -m pip install av`"
     assert missing_in(log)["left"] == f"{LEFT}: compressed video needs PyAV; {remedy}"
     project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
     assert [line[:4] for line in project["optional-dependencies"]["video"]] == ["av>="]
