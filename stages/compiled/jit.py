@@ -12,14 +12,15 @@ import functools
 import hashlib
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 import llvmlite
 import numba
 from numba import njit
-from numba.core import event
-from numba.core.caching import CacheImpl, _CacheLocator
+from numba.core import caching, event
+from numba.core.caching import CacheImpl, IndexDataCacheFile, _CacheLocator
 
 STAGES = Path(__file__).resolve().parent.parent
 PACKAGES = ("stages", "recordings")
@@ -58,6 +59,31 @@ class _KernelCacheLocator(_CacheLocator):
         return locator
 
 
+class _KernelCacheFile(IndexDataCacheFile):
+    """numba's files of a kernel. A damaged file counts as missing; a disk that takes no file costs only time."""
+
+    reported = False
+
+    def load(self, key: Any) -> Any:
+        with suppress(Exception):  # a damaged pickle fails in any way
+            return super().load(key)  # type: ignore[no-untyped-call]
+        return None
+
+    def save(self, key: Any, data: Any) -> None:
+        try:
+            super().save(key, data)  # type: ignore[no-untyped-call]
+        except OSError as error:
+            if not _KernelCacheFile.reported:
+                _KernelCacheFile.reported = True
+                remedy = "free some space, or set NUMBA_CACHE_DIR to a folder on another disk"
+                log.warning("cannot keep compiled kernels in %s: %s; %s", self._cache_path, error.strerror, remedy)
+
+    def _load_index(self) -> Any:
+        with suppress(Exception):  # likewise
+            return super()._load_index()  # type: ignore[no-untyped-call]
+        return {}
+
+
 class _Announcement(event.Listener):
     """Reports once that the first call of a stage's kernel takes longer."""
 
@@ -74,8 +100,9 @@ class _Announcement(event.Listener):
 
 
 def install() -> None:
-    """Register the cache locator and the announcement with numba."""
+    """Register the cache locator, the cache file and the announcement with numba."""
     caches: Any = CacheImpl
+    caching.IndexDataCacheFile = _KernelCacheFile  # type: ignore[misc]
     if _KernelCacheLocator not in caches._locator_classes:
         caches._locator_classes = [_KernelCacheLocator, *caches._locator_classes]
         event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]

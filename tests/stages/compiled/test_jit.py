@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from stages.matching.kernels.census import _census
+
 ROOT = Path(__file__).parents[3]
 JITS = {"kernel", "part", "fast_kernel", "fast_part", "typed_kernel", "borrowing_kernel", "njit"}
 SCRIPT = """
@@ -74,6 +76,29 @@ def test_kernels_are_cached_loaded_early_and_recompiled_after_a_change(run, tmp_
     assert after.startswith("True 0 0\n")
     assert after != first
     assert "compiling kernels" in stderr
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_a_damaged_file_of_the_cache_counts_as_missing(tmp_path, suffix):
+    kept = type(_census._cache._cache_file)(str(tmp_path), "kernel", "stamp")
+    kept.save("key", "code")
+    assert kept.load("key") == "code"
+    (file,) = tmp_path.glob(f"*.{suffix}")
+    for size in (0, file.stat().st_size - 2):
+        os.truncate(file, size)
+        assert kept.load("key") is None
+        kept.save("key", "code")
+        assert kept.load("key") == "code"
+
+
+def test_a_disk_that_takes_no_kernel_is_reported_once(tmp_path, monkeypatch, caplog):
+    kept = type(_census._cache._cache_file)(str(tmp_path / "missing"), "kernel", "stamp")
+    monkeypatch.setattr(type(kept), "reported", False)
+    for _ in range(2):
+        kept.save("key", "code")
+    (said,) = caplog.messages
+    assert said.startswith(f"cannot keep compiled kernels in {tmp_path / 'missing'}: No such file or directory; free ")
+    assert "set NUMBA_CACHE_DIR" in said
 
 
 @pytest.mark.slow
