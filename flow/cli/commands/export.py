@@ -68,7 +68,7 @@ def _written(options: argparse.Namespace, results: list[Path], lost: Counter[str
     if not options.merge:
         from recordings.export.bundle import export
 
-        places = _places(options, results[0])
+        places = _places(options, results[0], lost)
         return export(results[0], options.folder, options.frames, lost, options.maps, places), 0
     from recordings.export.merge import merge
 
@@ -79,18 +79,20 @@ def _written(options: argparse.Namespace, results: list[Path], lost: Counter[str
     return merged.files, sum(fault for fault, _ in found)
 
 
-def _places(options: argparse.Namespace, result: Path) -> dict[str, Georeference]:
+def _places(options: argparse.Namespace, result: Path, lost: Counter[str]) -> dict[str, Georeference]:
     """The place of each frame of reference, if it is wanted."""
     if options.crs is None:
         return {}
     from recordings.export.georeference import georeferences
+    from recordings.export.map_files import REGIONAL
     from recordings.scoring.result_log import input_beside
 
     if options.frames:
         raise UsageError("--crs georeferences regional maps only; leave out --frames")
     beside = input_beside(result)
     logs = [options.fixes] if options.fixes else [[result], *([beside] if beside[0].exists() else [])]
-    places = georeferences(result, logs, options.crs)
+    maps = [f"/nav/{name}" for name in options.maps] or [topic for topic in REGIONAL if topic]
+    places = georeferences(result, logs, options.crs, maps, lost)
     for name, place in places.items():
         say(place.sentence(name))
     return places
