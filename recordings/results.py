@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from recordings.errors import LogError
-from recordings.mcap.file import McapFile, iter_decoded
+from recordings.mcap.file import McapFile, by_stamp
 from recordings.ros2 import from_msg as ros2
 from recordings.ros2.plain import array_of
 from recordings.scoring.result_log import check_profile, facts_of
@@ -85,24 +84,23 @@ def read_result(path: Path | str, streams: Collection[str] = ()) -> Iterator[Res
     read = chosen.union(*(parts[topic] for topic in chosen))
     if any(schemas[topic] == _GRID_MAP for topic in chosen):
         read |= {"/tf", "/nav/diagnostics"}
-    for stamp, group in groupby(iter_decoded(path, sorted(read)), key=lambda item: item[1]):
-        messages = [(topic, message) for topic, _, message in group]
+    for stamp, messages in by_stamp(path, read):
         if items := dict(_items(messages, stamp, chosen, schemas)):
             yield ResultFrame(stamp, items)
 
 
 def _items(
-    messages: Sequence[tuple[str, Any]], stamp: int, chosen: Collection[str], schemas: Mapping[str, str]
+    messages: Mapping[str, Sequence[Any]], stamp: int, chosen: Collection[str], schemas: Mapping[str, str]
 ) -> Iterator[tuple[str, Any]]:
     """(Stream, item) of the messages of a stamp."""
-    by_topic = dict(messages)
-    for topic in sorted(by_topic.keys() & set(chosen)):
+    last = {topic: found[-1] for topic, found in messages.items()}
+    for topic in sorted(last.keys() & set(chosen)):
         schema = schemas[topic]
         if schema == _GRID_MAP:
             item: Any = ros2.read_regional_map(messages, topic, stamp)
         else:
-            parts = (by_topic.get(f"{topic}/{part}") for part in _PARTS.get(schema, ()))
-            item = _READERS[schema](by_topic[topic], *parts)
+            parts = (last.get(f"{topic}/{part}") for part in _PARTS.get(schema, ()))
+            item = _READERS[schema](last[topic], *parts)
         yield topic.removeprefix("/nav/"), item
 
 

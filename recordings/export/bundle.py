@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from itertools import groupby
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -31,10 +31,10 @@ from recordings.export.map_files import (
     write_whole,
 )
 from recordings.export.point_files import write_cells, write_points
-from recordings.mcap.file import McapFile, iter_decoded
+from recordings.mcap.file import McapFile, by_stamp, iter_decoded
 from recordings.ros2 import from_msg as ros2
 from recordings.scoring.result_log import without_results
-from stages.data import LEVEL_FRAME
+from stages.data import LEVEL_FRAME, Transform
 
 _SCHEMAS = {"elevation": "grid_map_msgs/msg/GridMap", "navigation": "nav_msgs/msg/OccupancyGrid"}
 
@@ -122,25 +122,14 @@ def _is_in_level(result: Path, topics: MapTopics, lost: Counter[str] | None) -> 
     return first is not None and first[2].header.frame_id == LEVEL_FRAME
 
 
-def _messages(result: Path, lost: Counter[str] | None, *topics: str | None) -> Iterator[tuple[int, dict[str, Any]]]:
-    """(stamp, topic -> message) of every frame.
-
-    Of diagnostics the list of statuses; "level" is the transform of frame `level`.
-    """
-    wanted = iter_decoded(result, [*(topic for topic in topics if topic), DIAGNOSTICS, "/tf"], lost)
-    for stamp, group in groupby(wanted, key=lambda item: item[1]):
-        frame: dict[str, Any] = {DIAGNOSTICS: []}
-        for topic, _, message in group:
-            if topic == DIAGNOSTICS:  # the last frame has several
-                frame[topic] += message.status
-                continue
-            if topic != "/tf":
-                frame[topic] = message
-                continue
-            for item in message.transforms:
-                if item.child_frame_id == LEVEL_FRAME:
-                    frame["level"] = ros2.transform_of(item)
-        yield stamp, frame
+def _frames(
+    result: Path, lost: Counter[str] | None, *topics: str | None
+) -> Iterator[tuple[int, dict[str, list[Any]], Transform | None]]:
+    """(stamp, topic -> messages, transform of frame `level`) of every frame."""
+    for stamp, frame in by_stamp(result, [*filter(None, topics), DIAGNOSTICS, "/tf"], lost):
+        transforms = chain.from_iterable(message.transforms for message in frame.get("/tf", ()))
+        levels = [ros2.transform_of(item) for item in transforms if item.child_frame_id == LEVEL_FRAME]
+        yield stamp, frame, levels[-1] if levels else None
 
 
 def _export_poses(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
@@ -182,14 +171,14 @@ def regions_of(result: Path, lost: Counter[str] | None, topics: MapTopics, color
     regions: dict[str, MapFiles] = {}
     newest: dict[str, MapFiles] = {}  # frame of reference -> the part that a frame belongs to
     leading = topics.elevation or topics.navigation
-    for stamp, frame in _messages(result, lost, *topics, POINTS if colored else None):
+    for stamp, frame, level in _frames(result, lost, *topics, POINTS if colored else None):
         if part := part_with(regions, topics, frame):
             part.add(result, topics, stamp, frame)
             newest[part.frame_id] = part
             if part.map_stamp < stamp:  # its last map came with the first frame of the next part
                 del newest[part.frame_id]
-        if "level" in frame and frame["level"].parent in newest:
-            newest[frame["level"].parent].color(result, frame)
+        if level is not None and level.parent in newest:
+            newest[level.parent].color(result, frame, level)
     if not regions:
         _check_damage(result, lost)
         remedy = "add --frames to export the maps of every frame"
@@ -204,14 +193,14 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None, topics: M
     """The maps of every frame, and its points if `points`, in a folder each."""
     files: list[Path] = []
     number = 0
-    for stamp, frame in _messages(result, lost, *topics, POINTS if points else None):
+    for stamp, frame, _ in _frames(result, lost, *topics, POINTS if points else None):
         folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
         maps = MapFiles(0.0)
-        maps.add(result, topics, stamp, {topic: frame[topic] for topic in topics if topic in frame})
+        maps.add(result, topics, stamp, frame)
         if maps.close():
             files += maps.write(folder, "at")
         if POINTS in frame:
-            fields = read(fields_of, frame[POINTS], result)
+            fields = read(fields_of, frame[POINTS][-1], result)
             files.append(write_whole(folder / "points.ply", write_points, fields, about_of(LEVEL_FRAME, "at", stamp)))
         number += len(files) > written_before
     if not files:

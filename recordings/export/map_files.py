@@ -21,7 +21,7 @@ from recordings.export.mosaic import STRIP_ROWS, Mosaic
 from recordings.export.point_files import CELL_COLOR, add_colors
 from recordings.ros2 import from_msg as ros2
 from recordings.sinks.colormaps import hillshade
-from stages.data import RIM_WIDTH, Array, Cell, ElevationMap, NavigationMap, Tiles
+from stages.data import RIM_WIDTH, Array, Cell, ElevationMap, NavigationMap, Tiles, Transform
 
 POINTS, DIAGNOSTICS = "/nav/points", "/nav/diagnostics"
 # The sun of other hillshades: in the north-west, 45 degrees high, where north is the picture's upper edge.
@@ -60,28 +60,28 @@ class MapFiles:
     place: Georeference | None = None
     wanted: Collection[str] = ()
 
-    def add(self, result: Path, topics: MapTopics, stamp: int, frame: dict[str, Any]) -> None:
+    def add(self, result: Path, topics: MapTopics, stamp: int, frame: dict[str, list[Any]]) -> None:
         """Add the maps of a frame."""
         self.stamp = stamp
         if topics.elevation in frame:
-            terrain: ElevationMap = read(ros2.read_grid_map, frame[topics.elevation], result)
+            terrain: ElevationMap = read(ros2.read_grid_map, frame[topics.elevation][-1], result)
             self.map_stamp = terrain.stamp
             layers = {name: terrain.layers[name] for name in self.wanted or terrain.layers}
             fills = dict.fromkeys(layers, np.float32(np.nan))
             self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
             self.elevation.add(layers, np.isfinite(terrain.layers["elevation"]), terrain)
         if topics.navigation in frame:
-            cells: NavigationMap = read(ros2.read_occupancy_grid, frame[topics.navigation], result)
+            cells: NavigationMap = read(ros2.read_occupancy_grid, frame[topics.navigation][-1], result)
             self.map_stamp = cells.stamp
             fill = {"cells": np.int8(Cell.UNKNOWN)}
             self.navigation = self.navigation or Mosaic(cells.resolution, cells.frame_id, fill, self.rim)
             self.navigation.add({"cells": cells.cells}, cells.cells != Cell.UNKNOWN, cells)
 
-    def color(self, result: Path, frame: dict[str, Any]) -> None:
+    def color(self, result: Path, frame: dict[str, list[Any]], level: Transform) -> None:
         """Add the colours of a frame's points; also of a frame whose map was left out of the log."""
         if self.elevation is not None and POINTS in frame:
-            points = read(fields_of, frame[POINTS], result)
-            add_colors(self.colors, points, frame["level"], self.elevation.resolution)
+            points = read(fields_of, frame[POINTS][-1], result)
+            add_colors(self.colors, points, level, self.elevation.resolution)
 
     @property
     def bounds(self) -> Mosaic | None:
@@ -121,7 +121,7 @@ class MapFiles:
 
 
 def part_with(
-    regions: dict[str, MapFiles], topics: MapTopics, frame: dict[str, Any], wanted: Collection[str] = ()
+    regions: dict[str, MapFiles], topics: MapTopics, frame: dict[str, list[Any]], wanted: Collection[str] = ()
 ) -> MapFiles | None:
     """The part of a regional map that the maps of a frame belong to, new in `regions` where it begins; None without.
 
@@ -131,8 +131,8 @@ def part_with(
     topic = next((topic for topic in topics if topic in frame), None)
     if topic is None:
         return None
-    frame_id = frame[topic].header.frame_id
-    epoch = ros2.epoch_of(frame[DIAGNOSTICS], topics.elevation or REGIONAL.elevation)
+    frame_id = frame[topic][-1].header.frame_id
+    epoch = ros2.epoch_of(frame.get(DIAGNOSTICS, ()), topics.elevation or REGIONAL.elevation)
     parts = [part for part in regions.values() if part.frame_id == frame_id]
     for part in reversed(parts):
         if epoch is None or part.epoch in (None, epoch):

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from functools import lru_cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -213,6 +214,17 @@ def iter_decoded(
     """
     with McapFile(Path(path)) as log:
         yield from decoded(log, topics, lost, part)
+
+
+def by_stamp(
+    path: Path, topics: Iterable[str], lost: Counter[str] | None = None, part: Edges = (None, None)
+) -> Iterator[tuple[int, dict[str, list[Any]]]]:
+    """Each stamp (log time, ns) of a result log, and topic -> its messages there: /tf and diagnostics have several."""
+    for stamp, group in groupby(iter_decoded(path, topics, lost, part), key=lambda item: item[1]):
+        messages = dict[str, list[Any]]()
+        for topic, _, message in group:
+            messages.setdefault(topic, []).append(message)
+        yield stamp, messages
 
 
 def decoded(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +12,8 @@ import numpy as np
 
 from recordings.export.map_files import DIAGNOSTICS, REGIONAL, MapFiles, part_with
 from recordings.export.png_pages import PAGES
-from recordings.mcap.file import iter_decoded
-from recordings.ros2.from_msg import read_disparity, read_occupancy_grid
+from recordings.mcap.file import by_stamp, iter_decoded
+from recordings.ros2.from_msg import losses_in, read_disparity, read_occupancy_grid
 from recordings.scoring.result_log import check_profile, end_of_run, facts_of
 from stages.data import Cell
 
@@ -52,14 +51,10 @@ def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) 
     about = facts_of(path, "a log that roverflow run wrote")
     check_profile(path, about)
     facts = RunFacts(path, about, end_of_run(path))
-    for stamp, group in groupby(iter_decoded(path, TOPICS, facts.unreadable), key=lambda item: item[1]):
-        messages: dict[str, Any] = {DIAGNOSTICS: []}
-        for topic, _, message in group:
-            _add(facts, topic, stamp, message)
-            if topic == DIAGNOSTICS:
-                messages[topic] += message.status
-            elif topic in REGIONAL:
-                messages[topic] = message
+    for stamp, messages in by_stamp(path, TOPICS, facts.unreadable):
+        for topic, found in messages.items():
+            for message in found:
+                _add(facts, topic, stamp, message)
         if part := part_with(facts.regional, REGIONAL, messages, wanted=("elevation",)):
             part.add(path, REGIONAL, stamp, messages)
     facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
@@ -88,10 +83,7 @@ def _add(facts: RunFacts, topic: str, stamp: int, message: Any) -> None:
         place = message.pose.pose.position
         facts.tracks.setdefault(message.header.frame_id, []).append((place.x, place.y))
     elif topic == DIAGNOSTICS:
-        for status in message.status:
-            found = {pair.key: pair.value for pair in status.values}
-            if "reason" in found:
-                facts.losses.append((found["stream"], found["stamp"], found["reason"], status.message))
+        facts.losses += losses_in(message)
     for name, value in values.items():
         facts.series.setdefault(name, {})[stamp] = value
 

@@ -6,7 +6,7 @@ The functions raise LogError for a message with invalid content.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from typing import Any
@@ -159,24 +159,28 @@ def read_grid_map(message: Any) -> ElevationMap:
     )  # fmt: skip
 
 
-def read_regional_map(messages: Sequence[tuple[str, Any]], topic: str, stamp: int) -> ElevationMap:
-    """A regional map among the messages of a stamp, with its epoch, and with frame `level` if it is of that stamp.
-
-    messages: topic and message; /tf may have several.
-    """
-    terrain = read_grid_map(dict(messages)[topic])
-    level = level_in((message for _, message in messages), terrain.frame_id) if terrain.stamp == stamp else None
-    statuses = chain.from_iterable(getattr(message, "status", ()) for _, message in messages)
-    return replace(terrain, level=level, epoch=epoch_of(statuses, topic))
+def read_regional_map(messages: Mapping[str, Sequence[Any]], topic: str, stamp: int) -> ElevationMap:
+    """A regional map among the messages of a stamp, with its epoch, and with frame `level` if it is of that stamp."""
+    terrain = read_grid_map(messages[topic][-1])
+    level = level_in(messages.get("/tf", ()), terrain.frame_id) if terrain.stamp == stamp else None
+    return replace(terrain, level=level, epoch=epoch_of(messages.get("/nav/diagnostics", ()), topic))
 
 
-def epoch_of(statuses: Iterable[Any], topic: str | None) -> int | None:
+def epoch_of(messages: Iterable[Any], topic: str | None) -> int | None:
     """The epoch, ns, of the map of a topic, by the diagnostics of its stamp; None if they do not contain it."""
-    for status in statuses:
+    for status in chain.from_iterable(message.status for message in messages):
         for pair in status.values if f"/nav/{status.name}" == topic else ():
             if pair.key == "epoch" and pair.value.removeprefix("-").isdecimal():
                 return int(pair.value)
     return None
+
+
+def losses_in(message: Any) -> Iterator[tuple[str, str, str, str]]:
+    """Stream, stamp, reason and detail of each loss in the diagnostics of a result log."""
+    for status in message.status:
+        found = {pair.key: pair.value for pair in status.values}
+        if "reason" in found:
+            yield found["stream"], found["stamp"], found["reason"], status.message
 
 
 def level_in(messages: Iterable[Any], parent: str) -> Transform | None:

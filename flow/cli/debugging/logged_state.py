@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,7 @@ from flow.cli.debugging.variants import Variants, sink_of
 from flow.errors import UsageError
 from flow.runtime.graph import Graph, Node
 from recordings.comparison.text import moment
-from recordings.mcap.file import McapFile, iter_decoded
+from recordings.mcap.file import McapFile, by_stamp
 from recordings.ros2.from_msg import pose_of, read_regional_map
 from recordings.scoring.result_log import about_run, check_profile
 from stages import Fuse, FuseRegion, MapRegion, PoseFilter, VisualOdometry
@@ -124,21 +123,19 @@ def logged_state(result: Path, graph: Graph, before: int) -> LoggedState | None:
     maps: dict[str, list[ElevationMap]] = {stream: [] for stream in map_topics.values()}
     poses = list[Pose]()
     topics = [*map_topics, *pose_topics, "/tf", "/nav/diagnostics"]
-    for stamp, group in groupby(iter_decoded(result, topics, part=(None, before)), key=lambda item: item[1]):
-        of_stamp = [(topic, message) for topic, _, message in group]
-        messages = dict(of_stamp)
+    for stamp, messages in by_stamp(result, topics, part=(None, before)):
         for topic in messages.keys() & map_topics.keys():
-            maps[map_topics[topic]].append(read_regional_map(of_stamp, topic, stamp))
-        found = (pose_of(messages[topic], stamp, "") for topic in messages.keys() & pose_topics)
+            maps[map_topics[topic]].append(read_regional_map(messages, topic, stamp))
+        found = (pose_of(messages[topic][-1], stamp, "") for topic in messages.keys() & pose_topics)
         poses += [pose for pose in found if pose is not None and segment_of(pose.frame_id) is not None]
     ends = [{part.stamp for part in parts if part.level is not None} for parts in maps.values()]
     ends = ends or [{pose.stamp for pose in poses}]
-    stamp = max(set.intersection(*ends), default=None)
-    if stamp is None:
+    last = max(set.intersection(*ends), default=None)
+    if last is None:
         return None
-    kept = {stream: [part for part in parts if part.stamp <= stamp] for stream, parts in maps.items()}
-    poses = [pose for pose in poses if pose.stamp <= stamp]
-    return LoggedState(stamp, kept, poses if poses and poses[-1].stamp == stamp else [])
+    kept = {stream: [part for part in parts if part.stamp <= last] for stream, parts in maps.items()}
+    poses = [pose for pose in poses if pose.stamp <= last]
+    return LoggedState(last, kept, poses if poses and poses[-1].stamp == last else [])
 
 
 def _topics(result: Path, graph: Graph) -> tuple[dict[str, str], set[str]]:

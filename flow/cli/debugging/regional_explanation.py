@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from flow.cli.debugging.result_input import graph_of, input_of
 from flow.errors import UsageError
 from flow.runtime.graph import Graph
 from recordings.comparison.text import moment
-from recordings.mcap.file import iter_decoded
+from recordings.mcap.file import by_stamp
 from recordings.results import read_result
 from recordings.ros2.from_msg import level_in, read_point_cloud
 from recordings.scoring.result_log import stamps_of
@@ -147,13 +146,11 @@ def _contributions(
 ) -> list[Contribution]:
     """The points of each frame of a map that lie in a cell. max_range: m, that a frame adds to the map."""
     found, part = list[Contribution](), (terrain.epoch, terrain.stamp + 1)
-    decoded = iter_decoded(result, ["/nav/points", "/tf"], part=part)
-    for stamp, group in groupby(decoded, key=lambda item: item[1]):
-        of_stamp = [(topic, message) for topic, _, message in group]
-        messages, level = dict(of_stamp), level_in((message for _, message in of_stamp), terrain.frame_id)
+    for stamp, messages in by_stamp(result, ["/nav/points", "/tf"], part=part):
+        level = level_in(messages.get("/tf", ()), terrain.frame_id)
         if level is None or "/nav/points" not in messages:
             continue
-        fields = read_point_cloud(messages["/nav/points"])
+        fields = read_point_cloud(messages["/nav/points"][-1])
         heights = _heights(fields, level, centre, terrain.resolution, max_range)
         if heights.size:
             found.append(Contribution(stamp, len(heights), float(heights.mean())))

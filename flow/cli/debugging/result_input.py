@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -128,11 +129,8 @@ def loss_at(stamp: int, ledger: Sequence[Mapping[str, Any]], result: Path | None
 def _logged_losses(result: Path, stamp: int) -> list[FrameLoss]:
     """The losses at a stamp, ns, in the diagnostics of a result log; they may be at another stamp."""
     from recordings.mcap.file import iter_decoded
+    from recordings.ros2.from_msg import losses_in
 
-    losses = list[FrameLoss]()
-    for _, _, message in iter_decoded(result, ["/nav/diagnostics"], Counter()):
-        for status in getattr(message, "status", ()):
-            found = {pair.key: pair.value for pair in status.values}
-            if found.get("stamp") == str(stamp) and "reason" in found:
-                losses.append(FrameLoss(found["stream"], found["reason"], status.message))
-    return losses
+    messages = (message for _, _, message in iter_decoded(result, ["/nav/diagnostics"], Counter()))
+    losses = chain.from_iterable(map(losses_in, messages))
+    return [FrameLoss(stream, reason, detail) for stream, at, reason, detail in losses if at == str(stamp)]
