@@ -25,6 +25,7 @@ from distributed import Client
 
 from flow.cli.fleet.catalogue import NAME, Catalogue
 from recordings.simulator import Simulation, write_log
+from tests.bench.pipeline import roverflow
 
 LOGS, FEW = 12, 4
 DIFFERENT, PORT = 20, 18790  # tiny logs that differ; of the scheduler
@@ -112,10 +113,8 @@ def _at_once(log: Path, out: Path) -> float:
 
 def _fleet(logs: list[Path], out: Path, processes: int) -> Fleet:
     """Run the logs, and read the catalogue."""
-    words = ["fleet", *map(str, logs), "--out", str(out), *SETTINGS, "--processes", str(processes)]
-    begun = time.perf_counter()
-    subprocess.run([sys.executable, "-m", "flow", *words], check=True, stdout=subprocess.DEVNULL)
-    seconds, rows = time.perf_counter() - begun, Catalogue(out).rows()
+    seconds = roverflow("fleet", *logs, "--out", out, *SETTINGS, "--processes", processes)
+    rows = Catalogue(out).rows()
     return Fleet(seconds, *(sum(row[name] for row in rows) for name in ("seconds", "cpu_seconds", "stage_seconds")))
 
 

@@ -10,8 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import struct
-import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -21,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from recordings.simulator import Simulation, write_log
 from recordings.source.mcap_source import McapSource
+from tests.bench.pipeline import roverflow
 
 FRAMES, FRAMES_PER_SECOND, CHUNK_BYTES = 20, 2, 4 << 20
 SMALL = 500_000_000  # bytes: as many frames in flight as in a large log
@@ -39,8 +38,8 @@ def main(arguments: list[str] | None = None) -> None:
         write_log(Simulation(frames=FRAMES, width=1280, height=960), folder / "once.mcap")
         logs = {size: _repeated(folder / "once.mcap", size, folder / f"{size}.mcap") for size in (SMALL, large)}
         for size, log in logs.items():
-            seconds, summary = _run("info", log), folder / "summary.json"
-            _run("run", log, "-o", folder / "out.mcap", "--every", 20, "--summary", summary)
+            seconds, summary = roverflow("info", log), folder / "summary.json"
+            roverflow("run", log, "-o", folder / "out.mcap", "--every", 20, "--summary", summary)
             memory = json.loads(summary.read_text())["peak_memory_mb"]
             print(f"{size / 1e9:5.2f} GB: info {seconds:5.2f} s; a run's peak memory {memory:.0f} MB")
         part = _repeated(folder / "once.mcap", 2 * large // 5, folder / "part.mcap")
@@ -87,13 +86,6 @@ def _later(data: bytes, by: int) -> bytes:
     seconds, rest = STAMP.unpack_from(data, 4)
     seconds, rest = divmod(seconds * 1_000_000_000 + rest + by, 1_000_000_000)
     return data[:4] + STAMP.pack(seconds, rest) + data[4 + STAMP.size :]
-
-
-def _run(*arguments: object) -> float:
-    """Wall seconds of a command."""
-    begun = time.perf_counter()
-    subprocess.run([sys.executable, "-m", "flow", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - begun
 
 
 if __name__ == "__main__":

@@ -49,7 +49,7 @@ def main(arguments: list[str] | None = None) -> None:
         for size in options.size:
             disparities = SIZES[size]
             log = Path(folder) / f"{size}.mcap"
-            _roverflow("simulate", log, "--frames", LONG, "--size", size)
+            roverflow("simulate", log, "--frames", LONG, "--size", size)
             match = _opencv(log, disparities)
             for pipeline in options.pipelines or PIPELINES[size]:
                 short, long, rounds = PAPER if pipeline == "paper" else (SHORT, LONG, ROUNDS)
@@ -86,9 +86,9 @@ def _round(
     out, file, reference, runs = log.with_name("out.mcap"), log.with_name("summary.json"), [match()], []
     for frames in lengths:
         arguments = ("-p", pipeline, "--set", f"disparities={disparities}", "--workers", cores, "--summary", file)
-        before = _cpu_of_children()
-        _roverflow("run", log, *arguments, "--end", _seconds(frames), "-o", out)
-        runs.append({**json.loads(file.read_text()), "whole_cpu": _cpu_of_children() - before})
+        before = cpu_of_children()
+        roverflow("run", log, *arguments, "--end", _seconds(frames), "-o", out)
+        runs.append({**json.loads(file.read_text()), "whole_cpu": cpu_of_children() - before})
         reference.append(match())
     (short, long), hh = runs, median(reference)
     frames = long["frames_through"] - short["frames_through"]
@@ -127,13 +127,17 @@ def _seconds(frames: int) -> float:
     return frames / 2 + 0.3
 
 
-def _cpu_of_children() -> float:
+def cpu_of_children() -> float:
+    """CPU time, s, of the commands that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def _roverflow(*arguments: object) -> None:
+def roverflow(*arguments: object) -> float:
+    """Run a command in a process of its own; its wall time, s."""
+    begun = time.perf_counter()
     subprocess.run([sys.executable, "-m", "flow", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - begun
 
 
 if __name__ == "__main__":

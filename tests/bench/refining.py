@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -25,7 +25,7 @@ from flow.runtime.evaluate import evaluate
 from flow.runtime.graph import Graph
 from stages import Disparity, StereoFrame
 from stages.data import Array
-from tests.bench.matching import colour_pair, medians
+from tests.bench.matching import colour_pair, in_gray, medians, opencv
 from tests.bench.stereo_scores import errors, load_scene
 
 DISPARITIES = 192
@@ -86,9 +86,7 @@ def speed() -> None:
     """Print times and ratios, in a process that keeps its memory as a run does."""
     keep_freed_memory()
     frame = colour_pair()
-    gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (frame.left, frame.right)]
-    matcher = cv2.StereoSGBM.create(0, DISPARITIES, 5, 4 * 25, 38 * 25, 1, 0, 1, 100, 2, cv2.STEREO_SGBM_MODE_HH)
-    contestants: dict[str, Callable[[], object]] = {"OpenCV MODE_HH, gray": lambda: matcher.compute(*gray)}
+    contestants = {"OpenCV MODE_HH, gray": opencv(cv2.STEREO_SGBM_MODE_HH, DISPARITIES, in_gray(frame))}
     for pipeline in ("accurate", "rover", "fast"):
         for threads in (1, 2):
             contestants[f"{pipeline}, match and refine, {threads} threads"] = (
@@ -103,12 +101,12 @@ def speed() -> None:
     print(f"{'1280x960, 192 disparities, median of ' + str(ROUNDS):48} {'ms':>8}")
     for name, value in seconds.items():
         print(f"{name:48} {1e3 * value:8.1f}")
-    opencv = seconds["OpenCV MODE_HH, gray"]
+    alone = seconds["OpenCV MODE_HH, gray"]
     support = seconds["rover, match and refine, 1 threads"] - seconds["rover without support, 1 threads"]
-    print(f"support over MODE_HH, on one core               {support / opencv:8.3f}")
+    print(f"support over MODE_HH, on one core               {support / alone:8.3f}")
     for pipeline in ("accurate", "rover", "fast"):
         whole = seconds[f"{pipeline}, match and refine, 2 threads"]
-        print(f"{pipeline} over MODE_HH alone                         {whole / opencv:8.3f}")
+        print(f"{pipeline} over MODE_HH alone                         {whole / alone:8.3f}")
 
 
 def accuracy(folder: Path) -> None:

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -30,6 +28,7 @@ from recordings.scoring.metrics import without_plane
 from recordings.simulator import Simulation, raycast, traverse, write_log
 from stages.data import LEVEL_FRAME, Array, ElevationMap, Pose, Transform
 from stages.terrain.height_alignment import fit_plane
+from tests.bench.pipeline import roverflow
 
 RUNS = ((11, 0.05), (12, 0.15), (13, 0.15))
 FRAMES = 8
@@ -131,9 +130,8 @@ def _run(simulation: Simulation, folder: Path) -> Path:
     """The result log of a simulation."""
     log, out, summary = (folder / name for name in ("log.mcap", "out.mcap", "summary.json"))
     write_log(simulation, log)
-    command = [sys.executable, "-m", "flow", "run", log, "-o", out, "--no-rrd", "--summary", summary]
-    command += ["--set", "regional_elevation.step=0"]  # a map a frame
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    setting = "regional_elevation.step=0"  # a map a frame
+    roverflow("run", log, "-o", out, "--no-rrd", "--summary", summary, "--set", setting)
     return out
 
 

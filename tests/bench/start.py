@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -18,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from recordings.simulator import Simulation, write_log
+from tests.bench.pipeline import cpu_of_children
 
 FRAMES, AT = 12, 2.5  # AT: an instant of the log, s
 CHANGE = "disparity.superpixels=2000"
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _answered(words: list[object], answer: str) -> tuple[float, float]:
     """Seconds until a command prints a line with `answer`, and the CPU time of the whole command, s."""
-    begun, before = time.perf_counter(), _cpu()
+    begun, before = time.perf_counter(), cpu_of_children()
     command = [sys.executable, "-m", "flow", *map(str, words)]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     answered = None
@@ -62,12 +62,7 @@ def _answered(words: list[object], answer: str) -> tuple[float, float]:
                 answered = time.perf_counter() - begun
     if answered is None:
         raise RuntimeError(f"{command} printed no line with '{answer}'")
-    return answered, _cpu() - before
-
-
-def _cpu() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+    return answered, cpu_of_children() - before
 
 
 if __name__ == "__main__":
