@@ -171,7 +171,7 @@ def regions_of(result: Path, lost: Counter[str] | None, topics: MapTopics, color
     regions: dict[str, MapFiles] = {}
     newest: dict[str, MapFiles] = {}  # frame of reference -> the part that a frame belongs to
     leading = topics.elevation or topics.navigation
-    for stamp, frame, level in _frames(result, lost, *topics, POINTS if colored else None):
+    for stamp, frame, level in _frames(result, lost, *topics, topics.reason, POINTS if colored else None):
         if part := part_with(regions, topics, frame):
             part.add(result, topics, stamp, frame)
             newest[part.frame_id] = part
@@ -193,7 +193,7 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None, topics: M
     """The maps of every frame, and its points if `points`, in a folder each."""
     files: list[Path] = []
     number = 0
-    for stamp, frame, _ in _frames(result, lost, *topics, POINTS if points else None):
+    for stamp, frame, _ in _frames(result, lost, *topics, topics.reason, POINTS if points else None):
         folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
         maps = MapFiles(0.0)
         maps.add(result, topics, stamp, frame)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +36,11 @@ class MapTopics(NamedTuple):
 
     elevation: str | None
     navigation: str | None
+
+    @property
+    def reason(self) -> str | None:
+        """The topic of the navigation map's reasons, which contain its exact cell size."""
+        return self.navigation and f"{self.navigation}/reason"
 
 
 REGIONAL = MapTopics("/nav/regional_map", "/nav/regional_navigation_map")
@@ -71,7 +77,9 @@ class MapFiles:
             self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
             self.elevation.add(layers, np.isfinite(terrain.layers["elevation"]), terrain)
         if topics.navigation in frame:
-            cells: NavigationMap = read(ros2.read_occupancy_grid, frame[topics.navigation][-1], result)
+            like = next((frame[topic][-1] for topic in (topics.elevation, topics.reason) if topic in frame), None)
+            reader = partial(ros2.read_occupancy_grid, like=like)
+            cells: NavigationMap = read(reader, frame[topics.navigation][-1], result)
             self.map_stamp = cells.stamp
             fill = {"cells": np.int8(Cell.UNKNOWN)}
             self.navigation = self.navigation or Mosaic(cells.resolution, cells.frame_id, fill, self.rim)
@@ -92,9 +100,9 @@ class MapFiles:
         """Whether any cell is known; the maps are cut to those, the navigation map as the elevation map."""
         if self.bounds is None or not self.bounds.close():
             return False
-        grids = {(each.frame_id, each.resolution) for each in (self.elevation, self.navigation) if each is not None}
-        if len(grids) > 1:
-            found = " and ".join(f"in '{name}' with cells of {size:g} m" for name, size in sorted(grids))
+        if self.navigation is not None and not self.bounds.has_grid(self.navigation):
+            grids = sorted((each.frame_id, each.resolution) for each in (self.bounds, self.navigation))
+            found = " and ".join(f"in '{name}' with cells of {size:g} m" for name, size in grids)
             raise LogError(f"the elevation map and the navigation map differ: {found}; export one at a time")
         return self.navigation is None or self.navigation.close(like=self.bounds)
 

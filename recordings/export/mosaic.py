@@ -16,7 +16,7 @@ from stages.data import RIM_WIDTH, Array, ElevationMap, NavigationMap, Tiles
 
 MAX_CELLS = 1 << 31  # of a rectangle; readers refuse larger pictures
 STRIP_ROWS = 256  # that are read at a time, so that no map is in memory as a whole
-_MAX_GRID_OFFSET = 1e-3  # of a cell, by rounding
+_MAX_GRID_OFFSET, _MAX_STRETCH = 1e-3, 1e-6  # of a cell, by rounding
 
 
 @dataclass(eq=False)
@@ -45,14 +45,17 @@ class Mosaic:
         row, col = self._first
         return col * self.resolution, row * self.resolution
 
+    def has_grid(self, grid: Mosaic | ElevationMap | NavigationMap) -> bool:
+        """Whether a map has the frame of reference and, but for rounding, the cell size of this one."""
+        return grid.frame_id == self.frame_id and abs(grid.resolution / self.resolution - 1) <= _MAX_STRETCH
+
     def add(self, layers: Mapping[str, Array], known: Array, grid: ElevationMap | NavigationMap) -> None:
         """Add a window of a grid, whose cells `known` (rows, cols) bool are to be in the rectangle.
 
         Raises LogError if it does not fit the windows before.
         """
         resolution, origin = grid.resolution, grid.origin
-        same = (grid.frame_id, list(layers)) == (self.frame_id, list(self.fills))
-        if not same or abs(resolution / self.resolution - 1) > 1e-6:
+        if list(layers) != list(self.fills) or not self.has_grid(grid):
             raise LogError(
                 f"the maps of the log differ: {', '.join(layers)} at {resolution:g} m in '{grid.frame_id}' after "
                 f"{', '.join(self.fills)} at {self.resolution:g} m in '{self.frame_id}'; export the parts separately"

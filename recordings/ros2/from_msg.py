@@ -201,10 +201,11 @@ def read_layers(message: Any) -> dict[str, Array]:
     return layers
 
 
-def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
+def read_occupancy_grid(message: Any, reasons: Any = None, like: Any = None) -> NavigationMap:
     """Cells and reasons of a nav_msgs/OccupancyGrid.
 
-    reasons: its `reason_map`, a grid_map_msgs/GridMap; without it the reason of a hazard is `REASON_NOT_RECORDED`.
+    reasons: its `reason_map`, a grid_map_msgs/GridMap; without it the reason of a hazard is `REASON_NOT_RECORDED`;
+    like: another GridMap on its cells.
     """
     info = message.info
     cells = np.asarray(message.data, np.int8).reshape(info.height, info.width)
@@ -213,6 +214,13 @@ def read_occupancy_grid(message: Any, reasons: Any = None) -> NavigationMap:
     reason[cells == Cell.UNKNOWN] = CellReason.UNOBSERVED
     if reasons is not None:
         reason = read_layers(reasons)["reason"].astype(np.uint8)
-    resolution = float(str(np.float32(info.resolution)))  # of float32, so 0.05 stays 0.05
     origin = (float(info.origin.position.x), float(info.origin.position.y))
-    return NavigationMap(stamp_of(message.header), cells, reason, resolution, origin, message.header.frame_id)
+    size = _cell_size(info, reasons, like)
+    return NavigationMap(stamp_of(message.header), cells, reason, size, origin, message.header.frame_id)
+
+
+def _cell_size(info: Any, *grids: Any) -> float:
+    """The cell size of a nav_msgs/MapMetaData, m: the float64 of a GridMap on its cells, else its shortest decimal."""
+    stored = np.float32(info.resolution)
+    exact = [float(grid.info.resolution) for grid in grids if grid is not None]
+    return next((size for size in exact if np.float32(size) == stored), float(str(stored)))

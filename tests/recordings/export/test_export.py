@@ -294,6 +294,22 @@ def test_a_map_far_from_its_frame_s_origin_keeps_its_place(tmp_path):
         assert file.bounds == pytest.approx((*corner, corner[0] + 0.2, corner[1] + 0.2), abs=1e-6, rel=0)
 
 
+@pytest.mark.parametrize("maps", [(), ("regional_navigation_map",)])
+def test_cells_whose_size_float32_rounds_keep_their_places(tmp_path, maps):
+    """An OccupancyGrid states 0.0333333333 m as 0.033333335 m, 30 cm off at 5000 km."""
+    size, first = 0.0333333333, (20_000_000, 150_000_000)
+    corner = (first[0] * size, first[1] * size)
+    elevation, navigation = (replace(item, resolution=size, origin=corner) for item in window(0, corner, (60, 60)))
+    messages = [
+        ("/nav/regional_map", ros2.grid_map(elevation)),
+        ("/nav/regional_navigation_map", ros2.occupancy_grid(navigation)),
+        ("/nav/regional_navigation_map/reason", ros2.reason_map(navigation)),
+    ]
+    export(written(tmp_path / "out.mcap", *messages), tmp_path / "out", maps=maps)
+    _, resolution, origin = as_map_server_reads(tmp_path / "out" / "navigation_map.yaml")
+    assert (resolution, origin) == (size, pytest.approx([*corner, 0.0], abs=1e-6, rel=0))
+
+
 def test_a_log_without_a_regional_map_names_the_remedy(tmp_path):
     path = written(tmp_path / "out.mcap", ("/nav/points", ros2.point_cloud(cloud(0))))
     with pytest.raises(LogError, match=r"no /nav/regional_map, only /nav/points: .* 'results' .* add --frames"):
