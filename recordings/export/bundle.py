@@ -63,7 +63,8 @@ def export(
         Streams to write instead of the regional map: an elevation map, a navigation map or one of each on the same
         grid. Maps in frame `level` are written for every frame.
     places
-        Frame of reference -> where it is; GeoTIFF and hillshade of regional maps in it are placed there.
+        Frame of reference -> where it is; GeoTIFF and hillshade of regional maps in it are placed there. Without any
+        of those the export is refused.
 
     Returns
     -------
@@ -88,6 +89,8 @@ def export(
         topics = _topics_of(result, maps)
         frames = frames or _is_in_level(result, topics, lost)
     poses = [] if maps else _export_poses(result, out, lost)
+    if frames and places:
+        raise LogError("--crs georeferences regional maps only, not those of every frame; leave out --crs")
     if frames:
         return _export_frames(result, out, lost, topics, points=not maps) + poses
     return _export_region(result, out, lost, topics, places) + poses
@@ -151,7 +154,11 @@ def _export_region(
     result: Path, out: Path, lost: Counter[str] | None, topics: MapTopics, places: Mapping[str, Georeference]
 ) -> list[Path]:
     """The regional map in `out`; if it was reset, a folder in `out` for each of its parts."""
-    known = regions_of(result, lost, topics)
+    remedy = "add --frames to export the maps of every frame"
+    known = regions_of(result, lost, topics, f"leave out --crs and {remedy}" if places else remedy)
+    if places and all(region.elevation is None or region.frame_id not in places for region in known.values()):
+        named = " or ".join(f"'{name}'" for name in places)
+        raise LogError(f"--crs georeferences elevation maps, and none in {named} is exported; leave out --crs")
     folders, files = _folders(known), []
     for name, region in known.items():
         region.place = places.get(region.frame_id)
@@ -163,10 +170,13 @@ def _export_region(
     return files
 
 
-def regions_of(result: Path, lost: Counter[str] | None, topics: MapTopics, colored: bool = True) -> dict[str, MapFiles]:
+def regions_of(
+    result: Path, lost: Counter[str] | None, topics: MapTopics, remedy: str, colored: bool = True
+) -> dict[str, MapFiles]:
     """Name -> each part of the regional map, with the colours of points if `colored`.
 
-    Raises LogError if the log has none, or one without known cells.
+    Raises LogError if the log has none, or one without known cells; with the `remedy` if it has maps of frames instead,
+    or if a part is too large.
     """
     regions: dict[str, MapFiles] = {}
     newest: dict[str, MapFiles] = {}  # frame of reference -> the part that a frame belongs to
@@ -181,9 +191,9 @@ def regions_of(result: Path, lost: Counter[str] | None, topics: MapTopics, color
             newest[level.parent].color(result, frame, level)
     if not regions:
         _check_damage(result, lost)
-        remedy = "add --frames to export the maps of every frame"
         raise without_results(result, (str(leading),), instead=(*map(str, FRAME), POINTS), remedy=remedy)
-    known = {name: region for name, region in regions.items() if region.close()}
+    advice = f": did the pose of {result} jump? {remedy}"
+    known = {name: region for name, region in regions.items() if region.close(advice)}
     if not known:
         raise LogError(f"no cell of {leading} in {result} is known: there is nothing to export")
     return known

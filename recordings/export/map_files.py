@@ -96,9 +96,12 @@ class MapFiles:
         """The map whose known cells bound both."""
         return self.elevation or self.navigation
 
-    def close(self) -> bool:
-        """Whether any cell is known; the maps are cut to those, the navigation map as the elevation map."""
-        if self.bounds is None or not self.bounds.close():
+    def close(self, advice: str = "") -> bool:
+        """Whether any cell is known; the maps are cut to those, the navigation map as the elevation map.
+
+        Raises LogError if the two differ in their grids or, with `advice`, if they are too large.
+        """
+        if self.bounds is None or not self.bounds.close(advice=advice):
             return False
         if self.navigation is not None and not self.bounds.has_grid(self.navigation):
             grids = sorted((each.frame_id, each.resolution) for each in (self.bounds, self.navigation))

@@ -11,7 +11,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,8 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
     for index in sorted(set().union(*regions)):
         parts = {number: region[index] for number, region in enumerate(regions, 1) if index in region}
         _add_tile(files, index, parts, merged)
-    files.close()
+    first, last = _farthest(regions)
+    files.close(f": are the poses of {results[first]} and {results[last]} in one frame of reference?")
     merged.files = files.write(out, "up to")
     with written(path := out / "merge.json") as temporary:
         temporary.write_text(json.dumps(merged.as_json(), indent=2))
@@ -178,6 +179,13 @@ def _check_inputs(results: Sequence[Path]) -> None:
 def _seconds(about: Mapping[str, str]) -> tuple[float, float]:
     """The part of its input that a run read."""
     return float(about.get("start") or "-inf"), float(about.get("end") or "inf")
+
+
+def _farthest(regions: Sequence[Mapping[tuple[int, int], Array]]) -> tuple[int, int]:
+    """Which two regional maps, of tiles by index, are farthest apart."""
+    centres = [np.mean(list(region), axis=0) for region in regions]
+    pairs = combinations_with_replacement(range(len(regions)), 2)
+    return max(pairs, key=lambda pair: float(np.abs(centres[pair[0]] - centres[pair[1]]).max()))
 
 
 def merged_cells(elevation: Array, variance: Array) -> tuple[Array, Array]:
@@ -224,7 +232,7 @@ def _add_tile(files: MapFiles, index: tuple[int, int], parts: Mapping[int, Array
 
 def _region(result: Path, lost: Counter[str] | None) -> tuple[Mosaic, dict[tuple[int, int], Array], int]:
     """The regional map of a log: its grid, its tiles of `_CELL`, and the last stamp."""
-    regions = regions_of(result, lost, REGIONAL, colored=False)
+    regions = regions_of(result, lost, REGIONAL, "leave it out", colored=False)
     if len(regions) > 1:
         names = ", ".join(regions)
         raise LogError(f"the regional map of {result} was reset (parts {names}); merging needs a map in one part")

@@ -79,10 +79,10 @@ class Mosaic:
             self._low = np.minimum(self._low, places.min(0) + first)
             self._high = np.maximum(self._high, places.max(0) + first)
 
-    def close(self, like: Mosaic | None = None) -> bool:
+    def close(self, like: Mosaic | None = None, advice: str = "") -> bool:
         """Set shape and origin, those of `like` if given; returns whether any cell is known.
 
-        Raises LogError if the rectangle is larger than `MAX_CELLS`.
+        Raises LogError with `advice` if the rectangle is larger than `MAX_CELLS`.
         """
         if like is not None:
             self.shape, self._first = like.shape, like._first
@@ -92,7 +92,7 @@ class Mosaic:
                 size = f"{cols * self.resolution:g} x {rows * self.resolution:g} m"
                 raise LogError(
                     f"the map in '{self.frame_id}' is {size}, too large for one picture with cells of "
-                    f"{self.resolution:g} m: did its pose jump? add --frames to export the maps of every frame"
+                    f"{self.resolution:g} m{advice}"
                 )
             self.shape, self._first = (rows, cols), (int(self._low[0]), int(self._low[1]))
         return min(self.shape) > 0

@@ -69,7 +69,10 @@ def _written(options: argparse.Namespace, results: list[Path], lost: Counter[str
         from recordings.export.bundle import export
 
         places = _places(options, results[0], lost)
-        return export(results[0], options.folder, options.frames, lost, options.maps, places), 0
+        files = export(results[0], options.folder, options.frames, lost, options.maps, places)
+        for name, place in places.items():
+            say(place.sentence(name))
+        return files, 0
     from recordings.export.merge import merge
 
     merged = merge(results, options.folder, lost)
@@ -92,10 +95,7 @@ def _places(options: argparse.Namespace, result: Path, lost: Counter[str]) -> di
     beside = input_beside(result)
     logs = [options.fixes] if options.fixes else [[result], *([beside] if beside[0].exists() else [])]
     maps = [f"/nav/{name}" for name in options.maps] or [topic for topic in REGIONAL if topic]
-    places = georeferences(result, logs, options.crs, maps, lost)
-    for name, place in places.items():
-        say(place.sentence(name))
-    return places
+    return georeferences(result, logs, options.crs, maps, lost)
 
 
 def _results(options: argparse.Namespace) -> list[Path]:

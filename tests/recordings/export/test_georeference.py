@@ -140,6 +140,19 @@ def test_the_fixes_of_all_files_of_an_input_count(result, tmp_path, said):
         assert f"by {FRAMES} fixes: residual 0.00 m RMS" in printed
 
 
+@pytest.mark.parametrize(("name", "why"), [
+    ("elevation_map", "--crs georeferences regional maps only, not those of every frame; leave out --crs"),
+    ("regional_navigation_map", "--crs georeferences elevation maps, and none in 'odom' is exported; leave out --crs"),
+])  # fmt: skip
+def test_a_map_that_has_no_georeference_is_refused(result, tmp_path, refused, capsys, name, why):
+    stamps, places = driven(result)
+    log = write_fixes(tmp_path / "fixes.mcap", stamps, on_grid(places, scale_at(ORIGIN[0])))
+    assert why in refused("export", result, tmp_path / "maps", "--map", name, "--crs", "utm", "--fixes", log)
+    assert not (tmp_path / "maps").exists()
+    assert roverflow("export", result, tmp_path / "maps", "--map", "regional_map", "--crs", "utm", "--fixes", log) == 0
+    assert capsys.readouterr().out.startswith("frame 'odom' is placed in EPSG:32633")
+
+
 def test_the_stated_errors_are_those_of_the_fixes(result, tmp_path):
     stamps, places = driven(result)
     log = write_fixes(tmp_path / "fixes.mcap", stamps, on_grid(places, scale_at(ORIGIN[0])), 0.005)

@@ -17,7 +17,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg as ros2
 from recordings.simulator import Simulation, write_log
 from stages.data import Cell, ElevationMap, NavigationMap
-from tests.conftest import chunks_of, edit_of, rewrite, roverflow, with_broken
+from tests.conftest import chunks_of, edit_of, rewrite, roverflow, with_broken, write_messages
 
 STEP, SHAPE = 0.1, (50, 60)
 
@@ -91,6 +91,13 @@ def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, refused,
         merge([a, other], tmp_path / "out")
     with pytest.raises(LogError, match=r"a\.mcap and .*a\.mcap are results of the same input, which would count twice"):
         merge([a, tmp_path / "x" / ".." / "a.mcap"], tmp_path / "out")
+    far = traverse(tmp_path / "far.mcap", 50_000_000, 1.0, 4e-4, hazard_col=-1)
+    with pytest.raises(LogError, match=r"too large .* are the poses of .*a\.mcap and .*far\.mcap in one frame of ref"):
+        merge([a, far], tmp_path / "out")
+    frame = ElevationMap(5, {"elevation": np.ones((2, 2), np.float32)}, STEP, (0.0, 0.0), "level")
+    own = write_messages(tmp_path / "own.mcap", [(5, "/nav/elevation_map", ros2.grid_map(frame))])
+    with pytest.raises(LogError, match=r"own\.mcap contains no /nav/regional_map, .*; leave it out$"):
+        merge([a, own], tmp_path / "out")
     broken = with_broken(a, chunks_of(a)[1][0])
     assert f"WARNING: {broken}: the chunk at byte" in said(3, "export", a, broken, tmp_path / "m", "--merge").out
     assert "add --merge to merge the maps of several logs" in refused("export", a, other, tmp_path / "out")
