@@ -10,6 +10,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import combinations, combinations_with_replacement
 from pathlib import Path
@@ -18,11 +19,12 @@ from typing import Any
 import numpy as np
 
 from recordings.atomic_write import written
+from recordings.containers.finding import find_files
 from recordings.errors import LogError
 from recordings.export.bundle import regions_of
 from recordings.export.map_files import REGIONAL, MapFiles
 from recordings.export.mosaic import Mosaic
-from recordings.scoring.result_log import about_run
+from recordings.scoring.result_log import about_run, input_beside, stamps_of
 from stages.data import TILE_SIDE, Array, Cell, ElevationMap
 
 MAX_SIGMAS = 3.0  # between two heights of a cell
@@ -169,11 +171,30 @@ def _check_inputs(results: Sequence[Path]) -> None:
     for first, second in combinations(range(len(results)), 2):
         inputs = [abouts[number].get("log_digest") or results[number].resolve() for number in (first, second)]
         (begin, end), (other_begin, other_end) = _seconds(abouts[first]), _seconds(abouts[second])
-        if inputs[0] == inputs[1] and begin < other_end and other_begin < end:
+        same = inputs[0] == inputs[1] and begin < other_end and other_begin < end
+        if same or _have_common_file(results[first], results[second]):
             raise LogError(
                 f"{results[first]} and {results[second]} are results of the same input, which would count twice; "
                 "give one of them"
             )
+
+
+def _have_common_file(one: Path, other: Path) -> bool:
+    """Whether inputs of different files, at least one of several, have a file in common: its name and a stamp in it."""
+    names, others = _files_of(one), _files_of(other)
+    if max(len(names), len(others)) < 2 or not names & others:
+        return False
+    return bool(np.isin(stamps_of(one), stamps_of(other)).any())
+
+
+def _files_of(result: Path) -> set[str]:
+    """The names of the files of a run's input; those in a folder only if it is beside the result."""
+    beside = input_beside(result)
+    if not beside[0].is_dir():
+        return set(about_run(result).get("log", "").split(", "))
+    with suppress(LogError):
+        return {file.name for file in find_files(beside).files}
+    return set()
 
 
 def _seconds(about: Mapping[str, str]) -> tuple[float, float]:

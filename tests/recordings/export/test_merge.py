@@ -23,8 +23,9 @@ STEP, SHAPE = 0.1, (50, 60)
 
 
 def traverse(
-    path: Path, first_col: int, height: float, variance: float, hazard_col: int, frame: str = "map", **about: str
-) -> Path:
+    path: Path, first_col: int, height: float, variance: float, hazard_col: int, frame: str = "map", stamp: int = 5,
+    **about: str,
+) -> Path:  # fmt: skip
     """A result log with a sloping map of SHAPE that begins at a column; one column of it is hazardous."""
     cols = first_col + np.arange(SHAPE[1])
     elevation = np.tile(np.float32(height + 0.01 * cols), (SHAPE[0], 1))
@@ -33,10 +34,11 @@ def traverse(
     origin = (first_col * STEP, -2.0)
     with Ros2Writer(path) as writer:
         writer.metadata("roverflow", about)
-        writer.write("/nav/regional_map", ros2.grid_map(ElevationMap(5, layers, STEP, origin, frame)), 5)
+        writer.write("/nav/diagnostics", ros2.diagnostics(stamp, []), stamp)
+        writer.write("/nav/regional_map", ros2.grid_map(ElevationMap(stamp, layers, STEP, origin, frame)), stamp)
         writer.flush()  # a broken second chunk leaves the heights
-        navigation = NavigationMap(5, cells, np.zeros(SHAPE, np.uint8), STEP, origin, frame)
-        writer.write("/nav/regional_navigation_map", ros2.occupancy_grid(navigation), 5)
+        navigation = NavigationMap(stamp, cells, np.zeros(SHAPE, np.uint8), STEP, origin, frame)
+        writer.write("/nav/regional_navigation_map", ros2.occupancy_grid(navigation), stamp)
     return path
 
 
@@ -108,6 +110,21 @@ def test_maps_that_cannot_be_merged_are_refused_in_a_sentence(tmp_path, refused,
 def test_results_with_a_common_part_of_an_input_are_refused(tmp_path, part, refused):
     first = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, -1, log_digest="d", start="", end="20.0")
     other = traverse(tmp_path / "b.mcap", 0, 1.0, 4e-4, -1, log_digest="d", start=part[0], end=part[1])
+    with pytest.raises(LogError, match="results of the same input") if refused else nullcontext():
+        merge([first, other], tmp_path / "out")
+
+
+@pytest.mark.parametrize(("log", "stamp", "refused"), [
+    ("drive_0.mcap, drive_1.mcap", 5, True), ("drive", 5, True), ("drive_0.mcap, drive_1.mcap", 6, False),
+    ("drive_1.mcap, drive_2.mcap", 5, False), ("drive_0.mcap", 5, False),
+])  # fmt: skip
+def test_results_with_a_common_file_of_their_inputs_are_refused(tmp_path, log, stamp, refused):
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    for number in range(2):
+        write_messages(folder / f"drive_{number}.mcap", [(5, "/nav/diagnostics", ros2.diagnostics(5, []))])
+    first = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, -1, log="drive_0.mcap", log_digest="a")
+    other = traverse(tmp_path / "b.mcap", 0, 1.0, 4e-4, -1, stamp=stamp, log=log, log_digest="b")
     with pytest.raises(LogError, match="results of the same input") if refused else nullcontext():
         merge([first, other], tmp_path / "out")
 
