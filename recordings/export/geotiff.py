@@ -32,7 +32,7 @@ LAYERS = {  # unit (UDUNITS) and meaning
     "maximum": ("m", "greatest height"),
     "count": ("", "measured points"),
     "interpolated": ("", "1: may rest on pixels of neighbouring cells only"),
-    "variance": ("m^2", "variance of the elevation within a frame"),
+    "variance": ("m^2", "variance of the elevation (of a frame's map: without common_variance)"),
     "common_variance": ("m^2", "variance of the elevation from the tilt"),
     "occluded": ("", "1: hidden from the cameras"),
     "ceiling": ("m", "lowest line of sight over an occluded cell"),

@@ -122,7 +122,8 @@ def test_every_layer_is_a_file_and_a_band_and_newer_windows_replace_older_ones(r
     np.testing.assert_array_equal(last, np.where(np.arange(50) < 10, 0, 1) * np.ones((30, 1)))
     with rasterio.open(tmp_path / "out" / "all-layers.tif") as file:
         assert (file.descriptions, file.units) == (("elevation", "variance", "last"), ("m", "m^2", "s"))
-        assert file.tags(1)["MEANING"] == "mean height"
+        meanings = "mean height", "variance of the elevation (of a frame's map: without common_variance)"
+        assert (file.tags(1)["MEANING"], file.tags(2)["MEANING"]) == meanings
         for band, name in enumerate(file.descriptions, 1):
             with rasterio.open(tmp_path / "out" / f"{name}.tif") as alone:
                 np.testing.assert_array_equal(file.read(band), alone.read(1))
