@@ -183,9 +183,9 @@ def regions_of(
     leading = topics.elevation or topics.navigation
     for stamp, frame, level in _frames(result, lost, *topics, topics.reason, POINTS if colored else None):
         if part := part_with(regions, topics, frame):
-            part.add(result, topics, stamp, frame)
+            part.add(result, topics, frame)
             newest[part.frame_id] = part
-            if part.map_stamp < stamp:  # its last map came with the first frame of the next part
+            if part.stamp < stamp:  # its last map came with the first frame of the next part
                 del newest[part.frame_id]
         if level is not None and level.parent in newest:
             newest[level.parent].color(result, frame, level)
@@ -206,7 +206,7 @@ def _export_frames(result: Path, out: Path, lost: Counter[str] | None, topics: M
     for stamp, frame, _ in _frames(result, lost, *topics, topics.reason, POINTS if points else None):
         folder, written_before = out / f"frame-{number:04d}-{stamp}", len(files)
         maps = MapFiles(0.0)
-        maps.add(result, topics, stamp, frame)
+        maps.add(result, topics, frame)
         if maps.close():
             files += maps.write(folder, "at")
         if POINTS in frame:

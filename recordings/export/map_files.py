@@ -52,7 +52,7 @@ class MapFiles:
     """Maps on one grid, as far as they have been read.
 
     wanted: layers of the elevation map; none: all; epoch: ns, from which the layers "first" and "last" count; stamp:
-    of the last frame with a map, ns; map_stamp: of that map, which may be that of an earlier frame.
+    of the last map, ns, which may be earlier than the frame that it came with.
     """
 
     rim: float
@@ -62,16 +62,14 @@ class MapFiles:
     navigation: Mosaic | None = None
     colors: Tiles = field(default_factory=lambda: Tiles(CELL_COLOR))
     stamp: int = 0
-    map_stamp: int = 0
     place: Georeference | None = None
     wanted: Collection[str] = ()
 
-    def add(self, result: Path, topics: MapTopics, stamp: int, frame: dict[str, list[Any]]) -> None:
+    def add(self, result: Path, topics: MapTopics, frame: dict[str, list[Any]]) -> None:
         """Add the maps of a frame."""
-        self.stamp = stamp
         if topics.elevation in frame:
             terrain: ElevationMap = read(ros2.read_grid_map, frame[topics.elevation][-1], result)
-            self.map_stamp = terrain.stamp
+            self.stamp = terrain.stamp
             layers = {name: terrain.layers[name] for name in self.wanted or terrain.layers}
             fills = dict.fromkeys(layers, np.float32(np.nan))
             self.elevation = self.elevation or Mosaic(terrain.resolution, terrain.frame_id, fills, self.rim)
@@ -80,7 +78,7 @@ class MapFiles:
             like = next((frame[topic][-1] for topic in (topics.elevation, topics.reason) if topic in frame), None)
             reader = partial(ros2.read_occupancy_grid, like=like)
             cells: NavigationMap = read(reader, frame[topics.navigation][-1], result)
-            self.map_stamp = cells.stamp
+            self.stamp = cells.stamp
             fill = {"cells": np.int8(Cell.UNKNOWN)}
             self.navigation = self.navigation or Mosaic(cells.resolution, cells.frame_id, fill, self.rim)
             self.navigation.add({"cells": cells.cells}, cells.cells != Cell.UNKNOWN, cells)

@@ -56,7 +56,7 @@ def read_facts(path: Path, beside: Mapping[str, tuple[int, Any]] | None = None) 
             for message in found:
                 _add(facts, topic, stamp, message)
         if part := part_with(facts.regional, REGIONAL, messages, wanted=("elevation",)):
-            part.add(path, REGIONAL, stamp, messages)
+            part.add(path, REGIONAL, messages)
     facts.stamps = sorted({stamp for values in facts.series.values() for stamp in values})
     chosen = {name: stamp for name, (stamp, _) in (beside or {}).items()}
     if not chosen or not set(chosen.values()) <= set(facts.stamps):

@@ -222,6 +222,8 @@ def test_points_of_the_frame_that_resets_a_map_colour_no_part_of_it(tmp_path):
         messages.append((sent.stamp, "/tf", ros2.transform_message([(LEVEL, sent.stamp)])))
     export(write_messages(tmp_path / "out.mcap", messages), tmp_path / "out")
     assert set(points_in(tmp_path / "out")["red"].tolist()) == {200}
+    with rasterio.open(tmp_path / "out" / "elevation.tif") as file:
+        assert f"up to {START} ns" in file.crs.to_wkt()
 
 
 def test_maps_of_two_frames_of_reference_are_not_laid_over_each_other(result, tmp_path):
