@@ -138,11 +138,12 @@ def _frames(
 def _export_poses(result: Path, out: Path, lost: Counter[str] | None) -> list[Path]:
     """The poses in each frame of reference, as TUM files: stamp in seconds, x y z, quaternion x y z w in a line."""
     lines: dict[str, list[str]] = {}
-    for _, stamp, message in iter_decoded(result, ["/nav/pose"], lost):
+    for _, _, message in iter_decoded(result, ["/nav/pose"], lost):
         place, turn = message.pose.pose.position, message.pose.pose.orientation
+        stamp = ros2.stamp_of(message.header)
         numbers = (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
         seconds = f"{stamp // 1_000_000_000}.{stamp % 1_000_000_000:09d}"
-        line = f"{seconds} {' '.join(f'{number:.9g}' for number in numbers)}\n"
+        line = f"{seconds} {' '.join(f'{number:.12g}' for number in numbers)}\n"
         lines.setdefault(message.header.frame_id, []).append(line)
     folders = _folders(lines)
     return [

@@ -17,7 +17,7 @@ from recordings.mcap.writer import Ros2Writer
 from recordings.reporting.page import write_report
 from recordings.ros2 import to_msg as ros2
 from stages.data import ElevationMap, Pose
-from tests.conftest import roverflow
+from tests.conftest import roverflow, write_messages
 
 
 def test_evo_reads_the_poses_of_a_result(result, tmp_path):
@@ -65,6 +65,23 @@ def test_poses_in_another_frame_of_reference_are_no_motion(tmp_path):
     write_report(tmp_path / "out.html", [path])
     page = (tmp_path / "out.html").read_text()
     assert [page.count(f"trajectory in {frame_id}, ") for frame_id in frames] == [1, 1]
+
+
+def test_poses_keep_their_stamps_and_a_tenth_of_a_millimetre_in_utm(tmp_path):
+    """In a result that was recorded again while it was played, log times are later."""
+    place, turn = np.array([691_234.56789, 9_333_333.12345, -12.34567]), np.array([1.23456789e-3, 0, 0, 1.0])
+    turn /= np.linalg.norm(turn)
+    stamp = 1_700_000_000_123_456_789
+    terrain = ElevationMap(stamp, {"elevation": np.zeros((3, 3), np.float32)}, 0.1, (0.0, 0.0), "utm")
+    messages = {
+        "/nav/pose": ros2.odometry(Pose(stamp, place, turn, "utm", "base_link", None)),
+        "/nav/regional_map": ros2.grid_map(terrain),
+    }
+    export(write_messages(tmp_path / "out.mcap", [(stamp + 10**9, *each) for each in messages.items()]), tmp_path)
+    seconds, *numbers = (tmp_path / "poses.tum").read_text().split()
+    assert seconds == "1700000000.123456789"
+    np.testing.assert_allclose([float(number) for number in numbers[:3]], place, rtol=0, atol=5e-5)
+    np.testing.assert_allclose([float(number) for number in numbers[3:]], turn, rtol=1e-9)
 
 
 def heading(trajectory):
