@@ -15,7 +15,7 @@ from typing import Any
 
 from flow.contracts import nearest
 from recordings.errors import LogError
-from recordings.export.georeference import Georeference
+from recordings.export.georeference import ONLY_REGIONAL, Georeference
 from recordings.export.map_files import (
     DIAGNOSTICS,
     FRAME,
@@ -90,7 +90,7 @@ def export(
         frames = frames or _is_in_level(result, topics, lost)
     poses = [] if maps else _export_poses(result, out, lost)
     if frames and places:
-        raise LogError("--crs georeferences regional maps only, not those of every frame; leave out --crs")
+        raise LogError(ONLY_REGIONAL)
     if frames:
         return _export_frames(result, out, lost, topics, points=not maps) + poses
     return _export_region(result, out, lost, topics, places) + poses

@@ -24,7 +24,7 @@ from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.export.fixes import read_fixes
 from recordings.mcap.file import iter_decoded
-from stages.data import Array
+from stages.data import LEVEL_FRAME, Array
 
 SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563  # of WGS 84
 SCALE, FALSE_EASTING, FALSE_NORTHING = 0.9996, 500_000.0, 10_000_000.0
@@ -32,6 +32,7 @@ MIN_FIXES, MAX_HEADING_SIGMA = 3, math.radians(2.0)
 MAX_APART_S = 0.5  # from a fix to a pose
 MAX_STRETCH = 0.1  # of the fixes against the drive
 MIRROR_SHARE, MIRROR_RATIO = 0.01, 3.0  # of the residual, to the drive and to the residual of the mirrored drive
+ONLY_REGIONAL = "--crs georeferences regional maps only, not those of every frame; leave out --crs"
 MAX_LONGITUDE = 9.0  # deg from the central meridian: the zone and those beside it
 _UTM = re.compile(r"EPSG:32([67])(0[1-9]|[1-5]\d|60)$", re.IGNORECASE)
 
@@ -144,6 +145,8 @@ def _poses(result: Path, maps: Collection[str], lost: Counter[str]) -> dict[str,
         rows.setdefault(message.header.frame_id, []).append((stamp, place.x, place.y))
     if not rows:
         raise LogError(f"{result} has no poses; run the log with a pose stream")
+    if mapped == {LEVEL_FRAME}:
+        raise LogError(ONLY_REGIONAL)
     if not mapped & rows.keys():
         named = " or ".join(f"'{name}'" for name in sorted(mapped)) or "a frame of a regional map"
         raise LogError(f"{result} has no poses in {named}; export without --crs")

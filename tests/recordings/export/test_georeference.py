@@ -15,7 +15,7 @@ from recordings.mcap.file import iter_decoded
 from recordings.mcap.writer import Ros2Writer
 from recordings.ros2 import to_msg
 from recordings.scoring.result_log import about_run
-from stages.data import NavigationMap, Pose
+from stages.data import ElevationMap, Pose
 from tests.conftest import FRAMES, rewrite, roverflow, write_messages
 
 TURN, ORIGIN = np.radians(37.0), np.array([412_345.6, 5_432_100.7])  # of the map's frame in zone 33
@@ -58,9 +58,9 @@ def degrees(stamps, latitudes, longitudes, topic="/gps/fix", status=0):
 
 def write_drive(path, stamps, places, frame_id="odom"):
     """A result of poses at places (n, 2), with a regional map in their frame."""
-    free = np.zeros((4, 4), np.int8)
-    grid = NavigationMap(int(stamps[0]), free, free.astype(np.uint8), 1.0, (0.0, 0.0), frame_id)
-    mapped = grid.stamp, str(REGIONAL.navigation), to_msg.occupancy_grid(grid)
+    layers = {name: np.ones((4, 4), np.float32) for name in ("elevation", "variance", "count")}
+    terrain = ElevationMap(int(stamps[0]), layers, 1.0, (0.0, 0.0), frame_id)
+    mapped = terrain.stamp, str(REGIONAL.elevation), to_msg.grid_map(terrain)
     return write_messages(path, [*poses_at(stamps, places, frame_id), mapped])
 
 
