@@ -20,7 +20,9 @@ from recordings.discovery.roles import (
     Topic,
     names_of,
 )  # fmt: skip
+from recordings.errors import LogError
 from recordings.inertial.imu_content import imu_content
+from recordings.ros2.from_msg import frame_of
 from recordings.source.settings import LogSettings
 from recordings.source.topics import DecodedTopics
 
@@ -97,9 +99,9 @@ def _search_tilt(topics: Sequence[Topic], messages: DecodedTopics, found: Discov
         )
         found.offer("inclinometer", "inclinometer", [topic.name for topic in choice])
     elif candidates:
-        found.missing["inclinometer"] = (
+        found.missing["inclinometer"] = next(filter(None, (_mixed(topic.name, messages) for topic in candidates)), (
             f"{names_of(candidates)} contains no orientation ({why}) and no accelerations; record one of them"
-        )
+        ))  # fmt: skip
     elif bare:
         found.missing["inclinometer"] = _undefined(bare[0])
         found.remedies["inclinometer"] = [remedy for topic in bare for remedy in _meanings(topic.name)]
@@ -147,6 +149,18 @@ def _find_gyroscope(
 
 def _accelerates(name: str, imus: Sequence[Topic], messages: DecodedTopics) -> bool:
     return name in {topic.name for topic in imus} and imu_content(messages, name).accelerations
+
+
+def _mixed(name: str, messages: DecodedTopics) -> str:
+    """That several sensors are on a topic; empty if all messages have one frame."""
+    frames = sorted({frame for frame in messages.sample(name, frame_of) if not isinstance(frame, LogError)})
+    if len(frames) < 2:
+        return ""
+    listed = ", ".join(f"'{frame}'" for frame in frames)
+    return (
+        f"{name} contains messages of several sensors (in the frames {listed}), which show no common tilt; record each "
+        "on a topic of its own"
+    )
 
 
 def _undefined(topic: Topic) -> str:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from recordings.containers.container import LostMessage, RawMessage
 from recordings.discovery.discover import VISUAL
+from recordings.inertial.blocks import InertialSample
 from recordings.inventory.poses import MaxGapOf, describe_poses, gap_sentence, sampled
 from recordings.inventory.search_range import UPSIDE_DOWN, search_range
 from recordings.scoring.result_log import about_run, pipeline_of
@@ -169,11 +170,11 @@ def _tilts(log: McapLog, damage: Damage, delays: array[int]) -> Stamps:
 
     Those of a large log are not decoded. delays: as of `_stamps`.
     """
-    if not _is_verified(log) or (log.resolution.tilt is not None and log.resolution.tilt.gyroscope):
+    if not _is_verified(log):
         return _stamps(log, "inclinometer", damage, delays)
     stamps = array("q")
-    for log_time, stream, item in log.events(("inclinometer",)):
-        if isinstance(item, Tilt):
+    for log_time, stream, item in log.events(("inclinometer",), estimate=False):
+        if isinstance(item, Tilt | InertialSample):
             stamps.append(item.stamp)
             delays.append(log_time - item.stamp)
         elif stream == "inclinometer":

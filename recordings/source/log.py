@@ -30,7 +30,7 @@ from recordings.source.moving_mount import MAX_GAP_NS, MovingMount
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.stream_readers import StreamReaders, by_channel
-from recordings.source.tilt_reading import Sampled, estimated_tilts
+from recordings.source.tilt_reading import Sampled, TiltReading, by_stamp, estimated_tilts
 from recordings.source.topics import TopicReader, attempt, with_lookahead
 from recordings.video.formats import VIDEO, VIDEO_NOTE
 from stages.data import CameraImage, Mount, Tilt
@@ -98,10 +98,13 @@ class McapLog(AbstractContextManager["McapLog"]):
         """Read only this part from now on, s after the first message."""
         self.start, self.end = start, end
 
-    def events(self, streams: Collection[str] = STREAMS) -> Iterator[tuple[int, str, Any]]:
-        """(Log time in ns, stream, item) for each message of some streams; a lost item is an exception."""
+    def events(self, streams: Collection[str] = STREAMS, estimate: bool = True) -> Iterator[tuple[int, str, Any]]:
+        """(Log time in ns, stream, item) for each message of some streams; a lost item is an exception.
+
+        estimate: whether to estimate tilts; else the samples of their stamps are the items.
+        """
         part = self._range()
-        return self._between(FramesInRange(part, self._lefts_around(part)), streams)
+        return self._between(FramesInRange(part, self._lefts_around(part)), streams, estimate=estimate)
 
     def excerpts(self, count: int, streams: Collection[str]) -> Iterator[Iterator[tuple[int, str, Any]]]:
         """The events of a few frames at `count` places of the whole log, independent of the range that is read."""
@@ -122,22 +125,29 @@ class McapLog(AbstractContextManager["McapLog"]):
                     yield self.stamp_of(raw, "left"), raw.log_time
 
     def _between(
-        self, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS
+        self, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS, estimate: bool = True
     ) -> Iterator[tuple[int, str, Any]]:
         events, tilt = self._read(frames, streams, ahead), self.resolution.tilt
         if "inclinometer" in streams and "inclinometer" in self.topics and tilt is not None and tilt.estimates:
-            events = merge(events, self._estimated(frames.part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
+            read = self._estimated if estimate else self._rated
+            events = merge(events, read(tilt, frames.part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
         for log_time, stream, item in events:
             offset = 0 if isinstance(item, Exception) else self.time_offset(stream)
             yield log_time, stream, replace(item, stamp=item.stamp + offset) if offset else item
 
-    def _estimated(self, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
+    def _rated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
+        """The samples with a rate, to whose stamps tilts are estimated."""
+        for log_time, item in by_stamp(tilt, self._samples(by_channel(self._readers.of_samples()), part)):
+            if isinstance(item, LogError) or item.rate is not None:
+                yield log_time, "inclinometer", item
+
+    def _estimated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
         """The estimates of up in a part of the log, also from samples before and after."""
         readers = by_channel(self._readers.of_samples())
         source, offset = self.source, self.time_offset("inclinometer")
         wide = part.widened(LOOKAHEAD_NS + min(abs(offset), MAX_LATENESS_NS))
         self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
-        for log_time, item in estimated_tilts(self._samples(readers, wide), self._estimator):
+        for log_time, item in estimated_tilts(tilt, self._samples(readers, wide), self._estimator):
             if part.has(item.stamp + offset if isinstance(item, Tilt) else 0, log_time):
                 yield log_time, "inclinometer", item
 
@@ -270,8 +280,7 @@ class McapLog(AbstractContextManager["McapLog"]):
 
     def time_offset(self, stream: str) -> int:
         """The time that is added to the stamps of a stream, ns."""
-        offset: int = getattr(self.source.time_offset, stream, 0)
-        return offset
+        return self.source.offset_of(stream)
 
     def channels(self, stream: str) -> set[int]:
         """The channels of a stream."""

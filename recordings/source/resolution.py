@@ -11,6 +11,7 @@ import numpy as np
 from flow.contracts import Finding, counted
 from recordings.calibration.log_calibration import INCLINOMETER, calibrations_of_files
 from recordings.containers.recording import Recording
+from recordings.containers.time_range import MAX_LATENESS_NS
 from recordings.discovery.discover import VISUAL, discover
 from recordings.discovery.roles import IMU, TRANSFORMS, DiscoveredTopics, Remedy, TiltKind
 from recordings.errors import LogError
@@ -23,7 +24,7 @@ from recordings.source.joints import read_joints
 from recordings.source.mount import ODOMETRY_FRAME, mount_of, pose_of_base
 from recordings.source.moving_mount import MovingMount, MovingTransforms, moving_mount
 from recordings.source.settings import LogSettings
-from recordings.source.tilt_reading import TiltReading
+from recordings.source.tilt_reading import TiltReading, rates_corrected
 from recordings.source.topics import MAX_TRIED, DecodedTopics, attempt
 from recordings.source.transforms import TransformTree, are_same
 from stages.data import LEVEL_FRAME, Mount, Pose, StereoCamera
@@ -201,10 +202,20 @@ class SourceResolution:
                 )
                 return
             turn = transform.rotation
+        lag = 0
+        if gyroscope not in ("", topic):
+            lag = self.messages.delay_of(gyroscope) - self.messages.delay_of(topic) - self.source.offset_of("gyroscope")
+        if abs(lag) > MAX_LATENESS_NS:
+            self.unavailable["inclinometer"] = (
+                f"the stamps of the accelerations ({topic}) and the rates ({gyroscope}) are of clocks that differ by "
+                f"{abs(lag) / 1e9:.1f} s; record both with one; {rates_corrected(lag, self.source)}, if both are "
+                "logged equally soon"
+            )
+            return
         why, is_imu = "", self.messages.schemas[topic] == IMU and self.source.accelerations is None
         if is_imu and kind != TiltKind.ORIENTATION:
             why = imu_content(self.messages, topic).no_orientation
-        self.tilt = TiltReading(kind, topic, gyroscope, turn, why)
+        self.tilt = TiltReading(kind, topic, gyroscope, turn, why, lag)
 
     def _resolve_mount(self) -> None:
         """The inclinometer's frame and the mount."""

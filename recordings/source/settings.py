@@ -22,6 +22,10 @@ class TimeOffsets(Checked):
     right: int = parameter(0, "time added to the stamps of the right images", unit="ns")
     inclinometer: int = parameter(0, "time added to the stamps of the tilts, negative if they are late", unit="ns")
     odometry: int = parameter(0, "time added to the stamps of the poses, negative if they are late", unit="ns")
+    gyroscope: int = parameter(
+        0, "time added to the stamps of angular rates on a topic of their own, so that they fit the accelerations",
+        unit="ns",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -109,6 +113,11 @@ class LogSettings:
         given = self.camera_from_inclinometer
         if given is not None and not _is_unit_quaternion(given):
             raise ValueError(f"McapSource.camera_from_inclinometer must be a unit quaternion x, y, z, w, not {given!r}")
+
+    def offset_of(self, stream: str) -> int:
+        """The time that is added to the stamps of a stream, or of the gyroscope, ns."""
+        offset: int = getattr(self.time_offset, stream, 0)
+        return offset
 
     def angles(self) -> BareAngles | None:
         """The meaning of bare angles; None if not set. Raises ValueError if only a part is set."""

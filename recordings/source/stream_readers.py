@@ -9,13 +9,15 @@ from functools import partial
 from typing import Any
 
 from recordings.errors import LogError
-from recordings.ros2.from_msg import pose_of
+from recordings.inertial.blocks import InertialSample
+from recordings.ros2.from_msg import frame_of, pose_of
 from recordings.source.cameras import CAMERAS, CalibrationHistory, ImageReading
 from recordings.source.mount import pose_of_base
 from recordings.source.moving_mount import MovingMount
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.tilt_noise import TiltNoise
+from recordings.source.tilt_reading import Sampler
 from recordings.source.topics import TopicReader
 from recordings.video.decoder import VideoDecoder
 from stages.data import Pose, Tilt
@@ -66,17 +68,30 @@ class StreamReaders:
 
         def checked(tilt: Callable[[Any, int], Tilt | None], message: Any, log_time: int) -> Tilt | None:
             made = tilt(message, log_time)
-            if made is not None and known and made.frame_id != known:
-                raise LogError(f"its frame is '{made.frame_id}', but the mount is that of '{known}'")
-            return None if made is None else noise(made)
+            if made is None:
+                return None
+            _check_frame(made.frame_id, known, "mount is that")
+            return noise(made)
 
         readers = reading.readers(self.source)
         return [self._reader("inclinometer", topic, partial(checked, tilt)) for topic, tilt in readers.items()]
 
     def of_samples(self) -> list[TopicReader]:
         """Those of the samples from which the tilt is estimated."""
-        samplers = self.resolution.tilt.samplers(self.source) if self.resolution.tilt is not None else {}
-        return [self._reader("inclinometer", topic, sample) for topic, sample in samplers.items()]
+        reading = self.resolution.tilt
+        if reading is None:
+            return []
+
+        def checked(known: str, of: str, sample: Sampler, message: Any, log_time: int) -> InertialSample:
+            _check_frame(frame_of(message), known, of)
+            return sample(message, log_time)
+
+        readers = list[TopicReader]()
+        for topic, sample in reading.samplers(self.source).items():
+            of = "mount is that" if topic == reading.topic else "rates are those"
+            item = partial(checked, self.resolution.messages.frame_of(topic), of, sample)
+            readers.append(self._reader("inclinometer", topic, item))
+        return readers
 
     def of_transforms(self, moving: MovingMount) -> list[TopicReader]:
         """Those of the transforms that move the camera."""
@@ -103,6 +118,12 @@ def by_channel(readers: Iterable[TopicReader]) -> dict[int, list[TopicReader]]:
         for channel in reader.decoders:
             found[channel].append(reader)
     return dict(found)
+
+
+def _check_frame(frame: str, known: str, of: str) -> None:
+    """Raise LogError for a message of another sensor on the topic. of: what is known of that frame."""
+    if known and frame != known:
+        raise LogError(f"its frame is '{frame}', but the {of} of '{known}'")
 
 
 def _by_stamp_alone(item: Callable[[Any, int], Any]) -> Callable[[Any, int], Any]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
 from typing import Any
 
 import numpy as np
 
 from flow.contracts import Finding, Severity
+from recordings.containers.time_range import MAX_LATENESS_NS
 from recordings.discovery.roles import TiltKind
 from recordings.errors import LogError
 from recordings.inertial.blocks import InertialSample
@@ -28,11 +29,13 @@ from recordings.ros2.tilt_from_msg import (
 from recordings.source.settings import LogSettings
 from stages.data import Array, Tilt
 
-REORDER_NS = 100_000_000  # by which samples of two topics may be logged out of order
+MAX_LAG_NS = 100_000_000  # of the rates after the accelerations, or before, that is not mentioned
+MAX_WAITING_NS = 120_000_000_000  # of samples for their tilts; an estimate that goes on makes them earlier
 MAX_JUMP_NS = 1_000_000_000  # of stamps against log times
 GRAVITIES = {"Earth": 9.81, "Mars": 3.71, "the Moon": 1.62}  # m/s^2
 GRAVITY_RTOL = 0.03
 
+Sampler = Callable[[Any, int], InertialSample]  # of a message and its log time
 Sampled = tuple[int, InertialSample | LogError]  # log time, ns, and what was logged then
 
 
@@ -41,7 +44,8 @@ class TiltReading:
     """What the tilts are made of.
 
     topic: of the inclinometer; gyroscope: of the rates, of an estimate; turn: (3, 3) rotation from the gyroscope's
-    frame to the inclinometer's; why: no orientation is used.
+    frame to the inclinometer's; why: no orientation is used; lag: by how much later after their stamps, ns, the rates
+    are logged than the accelerations.
     """
 
     kind: TiltKind
@@ -49,6 +53,7 @@ class TiltReading:
     gyroscope: str = ""
     turn: Array = field(default_factory=lambda: np.eye(3))
     why: str = ""
+    lag: int = 0
 
     def readers(self, settings: LogSettings) -> dict[str, Callable[[Any, int], Tilt | None]]:
         """Topic -> the function from a message and its log time to its tilt, if it has one."""
@@ -71,14 +76,20 @@ class TiltReading:
         """Whether the tilt is estimated from several messages."""
         return self.kind == TiltKind.ESTIMATE
 
-    def samplers(self, settings: LogSettings) -> dict[str, Callable[[Any, int], InertialSample]]:
-        """Topic -> the function from a message and its log time to its sample, for an estimate."""
+    def samplers(self, settings: LogSettings) -> dict[str, Sampler]:
+        """Topic -> the function to its samples, for an estimate."""
         read = settings.accelerations or acceleration_of
         if self.gyroscope == self.topic:
             return {self.topic: lambda message, time: sample_of(message, time, read(message), rate_of(message))}
+        offset = settings.offset_of("gyroscope")
+
+        def rated(message: Any, time: int) -> InertialSample:
+            sample = sample_of(message, time, None, self._turned(rate_of(message)))
+            return replace(sample, stamp=sample.stamp + offset)
+
         return {
             self.topic: lambda message, time: sample_of(message, time, read(message), None),
-            self.gyroscope: lambda message, time: sample_of(message, time, None, self._turned(rate_of(message))),
+            self.gyroscope: rated,
         }
 
     def _turned(self, rate: Vector | None) -> Vector | None:
@@ -99,12 +110,22 @@ class TiltReading:
         parts = f"accelerations and rates on {self.topic}"
         if self.gyroscope != self.topic:
             parts = f"accelerations on {self.topic} and the rates on {self.gyroscope}"
-        said = f"the tilt is estimated from the {parts}{because}"
+        said = f"the tilt is estimated from the {parts}{because}{self._lag(settings)}"
         if estimator is None or not estimator.seconds:
             return said
         return (
             f"{said}; at rest for {estimator.rest_seconds:.0f} of {estimator.seconds:.0f} s; "
             f"{_gravity(estimator.measured_gravity, settings.gravity)}"
+        )
+
+    def _lag(self, settings: LogSettings) -> str:
+        """What is unusual about the times at which accelerations and rates are logged."""
+        if abs(self.lag) <= MAX_LAG_NS:
+            return ""
+        when = "later" if self.lag > 0 else "earlier"
+        return (
+            f"; rates are logged {abs(self.lag) / 1e9:.2f} s {when} after their stamps than accelerations: if a clock "
+            f"is wrong, {rates_corrected(self.lag, settings)}"
         )
 
     def fault(self, estimator: UpEstimator) -> Finding | None:
@@ -119,6 +140,12 @@ class TiltReading:
         )
 
 
+def rates_corrected(lag: int, settings: LogSettings) -> str:
+    """The setting that corrects the stamps of rates. lag: as of TiltReading."""
+    offset = settings.offset_of("gyroscope") + lag
+    return f"--set source.time_offset.gyroscope={offset / 1e9:.3f}s corrects the rates"
+
+
 def _gravity(measured: float, given: float | None) -> str:
     """The measured magnitude of gravity, compared with that of the settings or of a planet."""
     found = f"gravity is {measured:.2f} m/s2"
@@ -129,17 +156,23 @@ def _gravity(measured: float, given: float | None) -> str:
     return f"{found}, as on {near[0]}" if near else f"{found}, unlike on {', '.join(GRAVITIES)}; check the unit"
 
 
-def estimated_tilts(samples: Iterable[Sampled], estimator: UpEstimator) -> Iterator[tuple[int, Tilt | LogError]]:
+def estimated_tilts(
+    reading: TiltReading, samples: Iterable[Sampled], estimator: UpEstimator
+) -> Iterator[tuple[int, Tilt | LogError]]:
     """The tilts of samples in the order of log time, with the log times of their samples; errors stay in place."""
     latest = 0
-    for log_time, item in _answers(samples, estimator):
+    for log_time, item in _answers(by_stamp(reading, samples), estimator):
         latest = max(latest, log_time)
         yield latest, item
 
 
 def _answers(samples: Iterable[Sampled], estimator: UpEstimator) -> Iterator[tuple[int, Tilt | LogError]]:
     waiting = deque[Sampled]()
-    for log_time, sample in _by_stamp(samples):
+    for log_time, sample in samples:
+        if waiting and log_time - waiting[0][0] > MAX_WAITING_NS:  # only errors, or no rates, have followed
+            yield from _answered(waiting, estimator.finish())
+            yield from ((time, item) for time, item in waiting if isinstance(item, LogError))
+            waiting.clear()
         waiting.append((log_time, sample))
         if not isinstance(sample, LogError):
             yield from _answered(waiting, estimator.push(sample))
@@ -159,15 +192,21 @@ def _answered(waiting: deque[Sampled], tilts: list[Tilt]) -> Iterator[tuple[int,
                 break
 
 
-def _by_stamp(samples: Iterable[Sampled]) -> Iterator[Sampled]:
-    """The samples in the order of stamps; a LogError in place of one whose stamp does not follow the one before."""
-    heap = list[tuple[int, int, int, InertialSample]]()
+def by_stamp(reading: TiltReading, samples: Iterable[Sampled]) -> Iterator[Sampled]:
+    """The samples in the order of stamps; a LogError in place of one whose stamp does not follow the one before.
+
+    Those of two topics may be logged out of order, up to 3 s apart.
+    """
+    heap = list[tuple[int, int, int, InertialSample | LogError]]()
     last = dict[bool, tuple[int, int]]()  # stamp and log time, of each of two topics
     doubted, newest = dict[bool, int](), dict[bool, InertialSample]()
-    given = 0  # the stamp up to which samples were given
+    given = reached = 0  # the stamps up to which samples were given, and up to which they were read
     for number, (log_time, sample) in enumerate(samples):
+        while heap and (heap[0][0] <= reached - MAX_LATENESS_NS or heap[0][2] <= log_time - MAX_LATENESS_NS):
+            given, _, time, first = heappop(heap)
+            yield time, first
         if isinstance(sample, LogError):
-            yield log_time, sample
+            heappush(heap, (reached, number, log_time, sample))
             continue
         topic = sample.rate is None
         if sample == newest.get(topic):  # recorded twice
@@ -178,13 +217,15 @@ def _by_stamp(samples: Iterable[Sampled]) -> Iterator[Sampled]:
         believed = 0 < sample.stamp - doubted.get(topic, sample.stamp) <= MAX_JUMP_NS  # two in a row are
         if sample.stamp <= stamp or sample.stamp < given or (ahead and not believed):
             doubted[topic] = sample.stamp
-            yield log_time, LogError(f"its stamp {sample.stamp} ns does not follow {max(stamp, given)} ns")
+            why = f"does not follow {stamp} ns"
+            if stamp < sample.stamp < given:
+                why = f"is {(reached - sample.stamp) / 1e9:.1f} s behind the other topic's; log both within 3 s"
+            names = reading.gyroscope, reading.topic
+            error = LogError(f"{names[topic]} at {log_time} ns: its stamp {sample.stamp} ns {why}")
+            heappush(heap, (reached, number, log_time, error))
             continue
-        last[topic] = sample.stamp, log_time
+        last[topic], reached = (sample.stamp, log_time), max(reached, sample.stamp)
         heappush(heap, (sample.stamp, number, log_time, sample))
-        while heap[0][0] <= sample.stamp - REORDER_NS:
-            given, _, time, first = heappop(heap)
-            yield time, first
     while heap:
         _, _, time, first = heappop(heap)
         yield time, first

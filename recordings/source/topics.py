@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import Any, TypeVar
 
 import numpy as np
@@ -151,6 +151,14 @@ class DecodedTopics:
             self._ahead[topic] = ahead if abs(ahead) > MAX_LATENESS_NS else 0
         return self._ahead[topic]
 
+    def delay_of(self, topic: str) -> int:
+        """The median of the log times less the stamps of a sample, ns; 0 for messages without stamps."""
+        channels = self.channels_of(topic)
+        parts = (islice(self.file.messages(channels, start), _MAX_SAMPLES) for start in self._places())
+        raws = [raw for raw in chain.from_iterable(parts) if isinstance(raw, RawMessage)]
+        delays = [raw.log_time - stamp for raw in raws if (stamp := self.stamp_of(raw))]
+        return int(np.median(delays)) if delays else 0
+
     def is_unstamped(self, topic: str) -> bool:
         """Whether the header stamps of a topic are 0 and not those of a clock that begins there."""
         return self.first(topic, lambda message: stamp_of(message.header)) == 0 and not self.ahead_of(topic)
@@ -167,10 +175,14 @@ class DecodedTopics:
 
     def sample(self, topic: str, make: Callable[[Any], T], most: int | None = None) -> Iterator[T | LogError]:
         """Convert some messages of a topic, spread over the log, without lost ones. most: of each part."""
-        for place in range(_SAMPLE_PLACES):
-            start = self.file.start + (self.file.end - self.file.start) * place // _SAMPLE_PLACES
+        for start in self._places():
             made = self.each(topic, make, start, allow_repeats=True)
             yield from islice((each for each in made if not isinstance(each, _GoneError)), most or _MAX_SAMPLES)
+
+    def _places(self) -> list[int]:
+        """The log times at which samples begin, ns."""
+        length = self.file.end - self.file.start
+        return [self.file.start + length * place // _SAMPLE_PLACES for place in range(_SAMPLE_PLACES)]
 
     def last(self, topic: str, make: Callable[[Any], T]) -> Iterator[T | LogError]:
         """Convert the messages of a topic at its last log time."""

@@ -13,11 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from flow.contracts import Severity
 from recordings import McapSource
+from recordings.discovery.roles import TiltKind
+from recordings.errors import LogError
+from recordings.inertial.up_estimator import UpEstimator
 from recordings.inventory.text import format_description
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import header, odometry, quaternion, raw_imu, transform_message
 from recordings.source.settings import TimeOffsets
+from recordings.source.tilt_reading import TiltReading, estimated_tilts
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite, slow, write_messages
 from tests.recordings.inertial.drive import Drive, drive
@@ -133,6 +137,48 @@ def test_samples_recorded_twice_are_no_loss(tmp_path):
     assert [tilt.stamp for tilt in tilts] == driven.stamps.tolist()
 
 
+def test_samples_of_another_sensor_on_the_topic_are_lost(tmp_path):
+    driven = drive(seconds=12)
+    turn = Rotation.from_euler("y", 20, degrees=True)
+
+    def mixed(number, stamp, rate, force):
+        if number % 2:
+            return kalibr(number, stamp, rate, force)
+        return {IMU: raw_imu(stamp, "rear_link", turn.apply(rate), turn.apply(force))}
+
+    path = written(tmp_path / "log.mcap", driven, lambda number, *sample: mixed(number + 1, *sample))
+    with McapSource().open(path) as log:
+        events = [(time, item) for time, stream, item in log.events() if stream == "inclinometer"]
+    tilts = {time: item for time, item in events if isinstance(item, Tilt)}
+    assert driven.errors(list(tilts.values())).max() < 0.6
+    assert all(time == tilt.stamp for time, tilt in tilts.items())  # losses do not delay them
+    assert len(events) - len(tilts) == len(driven.stamps) // 2
+    why = "its frame is 'rear_link', but the mount is that of 'imu_link'"
+    assert all(str(item).endswith(why) for _, item in events if not isinstance(item, Tilt))
+    damage = inventory_of(path)["damage"]
+    assert len(damage) == 1
+    assert why in damage[0]
+
+    def opposed(number, stamp, rate, force):
+        return {IMU: raw_imu(stamp, ("imu_link", "rear_link")[number % 2], rate, force * (-1) ** number)}
+
+    why = missing(written(tmp_path / "opposed.mcap", drive(seconds=4), opposed))
+    assert f"{IMU} contains messages of several sensors (in the frames 'imu_link', 'rear_link')" in why
+
+
+def test_tilts_and_losses_do_not_wait_for_the_end_of_a_log_of_losses():
+    driven, second = drive(seconds=8), 10**9
+    end = int(driven.stamps[-1])
+    logged = [(sample.stamp, sample) for sample in driven.samples()]
+    logged += [(end + number * second, LogError("broken")) for number in range(1, 1000)]
+    rest = iter(logged)
+    made = estimated_tilts(TiltReading(TiltKind.ESTIMATE, IMU, IMU), rest, UpEstimator("imu_link", 0.05))
+    first = [next(made) for _ in range(801)]
+    assert [time for time, _ in first] == [*driven.stamps.tolist(), end + second]
+    assert next(rest)[0] < end + 150 * second
+    assert sum(1 for _ in made) == 997  # without the one above
+
+
 def split(number, stamp, rate, force):
     """Accelerations and rates on two topics, of two frames, as of a RealSense."""
     gyroscope = Rotation.from_euler("z", -90, degrees=True).apply(rate)
@@ -172,6 +218,69 @@ def test_accelerations_and_rates_may_come_on_two_topics(tmp_path):
     assert offered == [{"gyroscope": "/one"}, {"gyroscope": "/two"}]
     assert all("inclinometer" not in missing_in(several, **settings) for settings in offered)
     assert "gyroscope' is set to /left/image_rect" in missing(named, gyroscope="/left/image_rect")
+
+
+def test_rates_of_another_gyroscope_on_the_topic_are_lost(tmp_path):
+    driven = drive(seconds=4)
+
+    def mixed(number, *sample):
+        found = split(number, *sample)
+        if number % 4 == 1:
+            found["/camera/gyro/sample"].header.frame_id = "other_link"
+        return found
+
+    tilts, lost, _ = read(written(tmp_path / "log.mcap", driven, mixed, GYRO))
+    assert (len(tilts), len(lost)) == (300, 100)
+    assert all("its frame is 'other_link', but the rates are those of 'gyro_link'" in sentence for sentence in lost)
+
+
+@pytest.mark.parametrize("late", ["accel", "gyro"])
+def test_rates_and_accelerations_may_be_logged_at_other_times(tmp_path, late):
+    driven = drive(seconds=15)
+    soon = written(tmp_path / "soon.mcap", driven, split, GYRO)
+    path = rewrite(soon, tmp_path / "log.mcap", time=lambda topic, time: time + 2 * 10**9 * (late in topic))
+    tilts, lost, note = read(path)
+    assert (len(tilts), lost) == (len(driven.stamps), [])
+    assert np.sqrt(np.mean(driven.errors(tilts) ** 2)) < 0.3
+    when, by = ("later", 2.002) if late == "gyro" else ("earlier", -1.998)
+    setting = f"if a clock is wrong, --set source.time_offset.gyroscope={by}s corrects the rates"
+    assert f"rates are logged 2.00 s {when} after their stamps than accelerations: {setting}" in note
+    assert "corrects the rates" not in read(soon)[2]
+    described = inventory_of(path)
+    assert (described["frames"]["with_tilt"], described["damage"]) == (5, [])
+    waiting = "tilts arrive in the log 2.0 s later than images of the same stamp; if no clock is wrong, --set tilt.pat"
+    assert (waiting in format_description(described)) == (late == "gyro")
+
+
+def test_rates_that_are_logged_too_late_are_lost_and_info_foresees_it(tmp_path):
+    driven = drive(seconds=15)
+    soon, since = written(tmp_path / "soon.mcap", driven, split, GYRO), int(driven.stamps[900])
+    late = lambda topic, time: time + 4 * 10**9 * ("gyro" in topic and time >= since)  # noqa: E731
+    path = rewrite(soon, tmp_path / "log.mcap", time=late)
+    tilts, lost, _ = read(path)
+    assert (len(tilts), len(lost)) == (900, 600)
+    assert f"/camera/gyro/sample at {since + 4 * 10**9} ns: its stamp {since} ns is 4.0 s behind" in lost[0]
+    described = inventory_of(path)
+    assert described["damage"][0].startswith("600 similar, first: /camera/gyro/sample at ")
+    assert described["frames"]["with_tilt"] == 3
+
+
+@pytest.mark.parametrize("behind", [1_000_000_000_000, -5_000_000_000])
+def test_rates_with_stamps_of_another_clock_are_refused_with_the_setting(tmp_path, behind):
+    driven = drive(seconds=6)
+
+    def apart(number, stamp, rate, force):
+        sample = split(number, stamp, rate, force)
+        return sample | {"/camera/gyro/sample": split(number, stamp - behind, rate, force)["/camera/gyro/sample"]}
+
+    path = written(tmp_path / "log.mcap", driven, apart, GYRO)
+    why = missing(path)
+    assert "(/camera/accel/sample) and the rates (/camera/gyro/sample) are of clocks that differ by" in why
+    assert f"--set source.time_offset.gyroscope={behind / 1e9 + 0.002:.3f}s corrects the rates" in why
+    tilts, lost, note = read(path, McapSource(time_offset=TimeOffsets(gyroscope=behind)))
+    assert (len(tilts), lost) == (len(driven.stamps), [])
+    assert driven.errors(tilts).max() < 0.6
+    assert "corrects the rates" not in note
 
 
 @pytest.mark.parametrize(("rates", "wrong"), [
