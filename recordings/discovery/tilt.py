@@ -34,7 +34,7 @@ def find_tilt(topics: Sequence[Topic], settings: LogSettings, messages: DecodedT
     apart = settings.pitch.topic if settings.pitch is not None else None
     given, setting = (apart, "pitch.topic") if apart is not None else (settings.inclinometer, "inclinometer")
     if given is None:
-        _search_tilt(topics, messages, found)
+        _search_tilt(topics, settings, messages, found)
     else:
         topic = next((topic for topic in topics if topic.name == given), None)
         if topic is None or topic.schema not in _schemas_of(found.tilt, topic.schema):
@@ -73,12 +73,15 @@ def _schemas_of(kind: TiltKind, schema: str) -> tuple[str, ...]:
     return () if schema in never else (schema,)
 
 
-def _search_tilt(topics: Sequence[Topic], messages: DecodedTopics, found: DiscoveredTopics) -> None:
+def _search_tilt(
+    topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics, found: DiscoveredTopics
+) -> None:
     """Find the inclinometer without a setting of its topic."""
     bare = [topic for topic in topics if topic.schema == BARE_TILT]
     candidates = {
         TiltKind.POSE: [topic for topic in topics if topic.schema in POSES and not topic.name.startswith(RESULTS)],
         TiltKind.ORIENTATION: [topic for topic in topics if topic.schema in TILTS],
+        TiltKind.ACCELERATIONS: _accelerating(topics, settings, messages),
     }.get(found.tilt, bare)
     choice, why = candidates, ""
     if found.tilt == TiltKind.ORIENTATION:
@@ -130,7 +133,7 @@ def _find_gyroscope(
                 return
             found.chosen["inclinometer"] = own
         rated = [settings.gyroscope]
-    elif settings.accelerations is not None:
+    elif own not in {topic.name for topic in imus}:
         return
     else:
         rated = [topic.name for topic in imus if imu_content(messages, topic.name).rates]
@@ -145,6 +148,16 @@ def _find_gyroscope(
         found.offer("inclinometer", "gyroscope", rated)
     elif rated:
         found.tilt, found.chosen["gyroscope"] = TiltKind.ESTIMATE, rated[0]
+
+
+def _accelerating(topics: Sequence[Topic], settings: LogSettings, messages: DecodedTopics) -> list[Topic]:
+    """The topics with the field of the setting 'accelerations', without Imus of rates alone; all, if none has it."""
+    field, imus = settings.accelerations, [topic for topic in topics if topic.schema == IMU]
+    every = [topic for topic in topics if topic.schema in (BARE_TILT, IMU)]
+    if field is None:
+        return every
+    named = [topic for topic in every if not isinstance(messages.first(topic.name, field), LogError)]
+    return [topic for topic in named if topic not in imus or _accelerates(topic.name, imus, messages)] or named or every
 
 
 def _accelerates(name: str, imus: Sequence[Topic], messages: DecodedTopics) -> bool:

@@ -133,7 +133,8 @@ class SourceResolution:
             if isinstance(checked, LogError):
                 found.chosen.pop("inclinometer", None)
                 names = "accelerations" if angles is None else "pitch and roll"
-                found.refuse("inclinometer", names, f"the {found.tilt} of {of}: {checked}")
+                kind = names if angles is None else found.tilt
+                found.refuse("inclinometer", names, f"the {kind} of {of}: {checked}")
         return found
 
     def notes(self, estimator: UpEstimator | None) -> list[tuple[str, str]]:

@@ -54,7 +54,7 @@ class LogSettings:
         None, "topic of an Imu with angular rates; the tilt is then estimated, even if there is an orientation"
     )
     accelerations: AccelerationField | None = parameter(
-        None, "field of the accelerations, for an inclinometer that is not an Imu"
+        None, "field of the accelerations, for an inclinometer that is not an Imu, or an Imu that has them negated"
     )
     gravity: float | None = parameter(
         None, "magnitude of gravity, for an estimated tilt (Mars: 3.71, Moon: 1.62); none: measured",

@@ -364,6 +364,25 @@ def test_an_inclinometer_may_log_three_accelerations(tmp_path, field, sign):
     assert "has no field 'angles.x'" in missing(path, accelerations=AccelerationField("angles"))
 
 
+@pytest.mark.parametrize("named", [{}, {"gyroscope": IMU}, {"inclinometer": IMU}])
+def test_an_imu_with_negated_accelerations_is_found_by_their_field(tmp_path, named):
+    driven = drive(seconds=6)
+    path = written(tmp_path / "log.mcap", driven, lambda number, t, rate, force: kalibr(number, t, rate, -force))
+    tilts, lost, note = read(path, McapSource(accelerations=AccelerationField("linear_acceleration", -1), **named))
+    assert (len(tilts), lost) == (len(driven.stamps), [])
+    assert driven.errors(tilts).max() < 0.6
+    assert note.startswith(f"the tilt is estimated from the accelerations and rates on {IMU}; at rest")
+    assert "has no field 'vector.x'" in missing(path, accelerations=AccelerationField("vector"), **named)
+
+
+def test_the_accelerations_of_the_setting_are_not_those_of_a_gyroscope(tmp_path):
+    driven = drive(seconds=4)
+    path = written(tmp_path / "log.mcap", driven, split, GYRO)
+    tilts, _, note = read(path, McapSource(accelerations=AccelerationField("linear_acceleration")))
+    assert "the accelerations on /camera/accel/sample and the rates on /camera/gyro/sample" in note
+    assert driven.errors(tilts).max() < 0.6
+
+
 def test_an_imu_without_rates_gives_the_direction_of_each_acceleration(tmp_path):
     driven = drive(seconds=6)
     path = written(tmp_path / "log.mcap", driven, lambda n, t, rate, force: kalibr(n, t, np.zeros(3), force))
