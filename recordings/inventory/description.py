@@ -98,6 +98,7 @@ def describe(
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
             "delay_s": [float(np.quantile(delays, part)) / 1e9 for part in (0, 0.5, 1)] if delays else None,
             "tilt_delay_s": float(np.median(of_tilts)) / 1e9 if of_tilts else None,
+            "tilt_delay_spread_s": float(np.ptp(np.quantile(of_tilts, (0.1, 0.9)))) / 1e9 if of_tilts else None,
             "tilt_offset_s": log.time_offset("inclinometer") / 1e9,
         },
         "poses": poses,

@@ -68,6 +68,9 @@ def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
     if abs(late) > MAX_LATENESS_NS / 1e9 and frames["with_tilt"] == 0:
         differ = f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s"
         yield f"{differ}; record both with one; {corrected}, if both are logged equally soon"
+    elif (spread := frames["tilt_delay_spread_s"] or 0) > MAX_TILT_DELAY:
+        remedy = "if a clock was set, run the parts before and after it separately (--end; --start, a second later)"
+        yield f"the stamps of tilts are up to {spread:.1f} s further from their log times than others; {remedy}"
     elif late > MAX_TILT_DELAY:
         remedy = (
             f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them; else {corrected}"

@@ -182,6 +182,13 @@ def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
     assert "--set tilt.patience=22s" in format_description(inventory_of(late))
 
 
+def test_stamps_of_tilts_that_are_set_back_within_the_log_are_doubted(tmp_path):
+    doubt = "doubtful: the stamps of tilts are up to 3.0 s further from their log times than others; if a clock was set"
+    back = changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 3}, range(3, FRAMES))
+    assert doubt in text_of(tmp_path, back)
+    assert "further from" not in text_of(tmp_path, changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 3}))
+
+
 WIDER = "differ by up to 8 ms; if they are taken at one time, --set stereo.slop=8ms pairs most of them"
 
 
