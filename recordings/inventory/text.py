@@ -69,7 +69,7 @@ def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
         differ = f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s"
         yield f"{differ}; record both with one; {corrected}, if both are logged equally soon"
     elif (spread := frames["tilt_delay_spread_s"] or 0) > MAX_TILT_DELAY:
-        remedy = "if a clock was set, run the parts before and after it separately (--end; --start, a second later)"
+        remedy = "if a clock was set, cut the log there and run each part; info then names its source.time_offset"
         yield f"the stamps of tilts are up to {spread:.1f} s further from their log times than others; {remedy}"
     elif late > MAX_TILT_DELAY:
         remedy = (
