@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from heapq import merge
-from itertools import chain
+from itertools import chain, islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -115,7 +115,7 @@ class McapLog(AbstractContextManager["McapLog"]):
             # Stamps precede log times, so begin after the previous image.
             low = times[first - 1] + 1 if first else None
             part = TimeRange(low, times[last] + MAX_LATENESS_NS)
-            yield self._between(FramesInRange(part, ()), streams, ahead)
+            yield self._between(FramesInRange(part, ()), streams, ahead, whole=False)
 
     def _lefts_around(self, part: TimeRange) -> Iterator[tuple[int, int]]:
         """Stamp and log time, ns, of the left images around the edges of a part."""
@@ -125,12 +125,15 @@ class McapLog(AbstractContextManager["McapLog"]):
                     yield self.stamp_of(raw, "left"), raw.log_time
 
     def _between(
-        self, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS, estimate: bool = True
-    ) -> Iterator[tuple[int, str, Any]]:
+        self, frames: FramesInRange, streams: Collection[str], ahead: int = MAX_LATENESS_NS, whole: bool = True,
+        estimate: bool = True,
+    ) -> Iterator[tuple[int, str, Any]]:  # fmt: skip
+        """The events of some frames. ahead: as for `_read`; whole: as for `_estimated`; estimate: as for `events`."""
         events, tilt = self._read(frames, streams, ahead), self.resolution.tilt
         if "inclinometer" in streams and "inclinometer" in self.topics and tilt is not None and tilt.estimates:
-            read = self._estimated if estimate else self._rated
-            events = merge(events, read(tilt, frames.part.widened(INTERPOLATION_LEAD_NS)), key=itemgetter(0))
+            near = frames.part.widened(INTERPOLATION_LEAD_NS)
+            read = self._estimated(tilt, near, whole) if estimate else self._rated(tilt, near)
+            events = merge(events, read, key=itemgetter(0))
         for log_time, stream, item in events:
             offset = 0 if isinstance(item, Exception) else self.time_offset(stream)
             yield log_time, stream, replace(item, stamp=item.stamp + offset) if offset else item
@@ -141,15 +144,29 @@ class McapLog(AbstractContextManager["McapLog"]):
             if isinstance(item, LogError) or item.rate is not None:
                 yield log_time, "inclinometer", item
 
-    def _estimated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
-        """The estimates of up in a part of the log, also from samples before and after."""
+    def _estimated(self, tilt: TiltReading, part: TimeRange, whole: bool) -> Iterator[tuple[int, str, Any]]:
+        """The estimates of up in a part of the log, also from samples after and before.
+
+        whole: from all before, which show the biases; the estimates are then those of a run of the whole log. Where
+        stamps have jumped since its beginning, only the last ones before are read.
+        """
         readers = by_channel(self._readers.of_samples())
         source, offset = self.source, self.time_offset("inclinometer")
         wide = part.widened(LOOKAHEAD_NS + min(abs(offset), MAX_LATENESS_NS))
+        if whole and not self._have_jumped(set(readers), wide.low):
+            wide = replace(wide, low=None)
         self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
         for log_time, item in estimated_tilts(tilt, self._samples(readers, wide), self._estimator):
             if part.has(item.stamp + offset if isinstance(item, Tilt) else 0, log_time):
                 yield log_time, "inclinometer", item
+
+    def _have_jumped(self, channels: set[int], since: int | None) -> bool:
+        """Whether the stamps of messages from a log time on are of another clock than those at the log's beginning."""
+        ahead = list[int]()
+        for low in (None, since):
+            raws = (raw for raw in self.file.messages(channels, low) if isinstance(raw, RawMessage))
+            ahead += [self.stamp_of(raw, "inclinometer") - raw.log_time for raw in islice(raws, 1)]
+        return len(ahead) == 2 and abs(ahead[1] - ahead[0]) > MAX_LATENESS_NS
 
     def _samples(self, readers: dict[int, list[TopicReader]], part: TimeRange) -> Iterator[Sampled]:
         """What these readers read, without lost messages, which `_read` reports."""

@@ -114,6 +114,24 @@ def test_a_part_of_a_log_has_the_estimates_around_it_by_corrected_stamps(tmp_pat
     assert driven.errors(tilts).max() < 0.6
 
 
+def test_a_part_of_a_log_has_the_estimates_of_the_whole_log(tmp_path):
+    path = written(tmp_path / "log.mcap", drive(seconds=40))
+    whole, part = ({tilt.stamp: tilt for tilt in read(path, **bounds)[0]} for bounds in ({}, {"start": 24, "end": 25}))
+    assert len(part) == 300
+    assert all(np.array_equal(tilt.up, whole[stamp].up) for stamp, tilt in part.items())
+    assert all(tilt.sigma == whole[stamp].sigma for stamp, tilt in part.items())
+
+
+def test_a_part_after_stamps_have_jumped_back_is_estimated_from_those_after(tmp_path):
+    driven = drive(seconds=60)
+    back = int(driven.stamps[2000])
+    path = written(
+        tmp_path / "log.mcap", driven,
+        lambda number, stamp, *values: kalibr(number, stamp - 3600 * 10**9 * (stamp > back), *values),
+    )  # fmt: skip
+    assert len(read(path, start=48, end=49)[0]) == 300
+
+
 def test_a_broken_sample_is_lost_alone_and_so_is_a_wrong_stamp(tmp_path):
     driven = drive(seconds=12)
 
