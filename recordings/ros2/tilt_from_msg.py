@@ -27,7 +27,7 @@ from stages.data import Array, Tilt
 Vector = tuple[float, float, float]
 
 MIN_ACCELERATION = 0.1  # m/s^2; less contains no gravity
-MAX_STATED_SIGMA = np.radians(20.0)  # beyond it a covariance says only that the driver does not know
+MAX_STATED_SIGMA = math.pi / 2  # rad, of an unknown direction, for which drivers state 1e6 rad^2
 MAX_WAITING_ROLLS = 1000  # that no pitch follows
 _MAX_PLACES = 100  # of an array of numbers, that a field may be
 
@@ -109,19 +109,19 @@ def _stamp_of(message: Any, log_time: int) -> int:
 
 
 def _stated_sigma(covariance: Array) -> float | None:
-    """Standard deviation, rad, about the two axes that are surer than the third, which is the heading's; None for zeros
-    (unknown) and for what is no covariance of a tilt."""
+    """Standard deviation, rad, about the two level axes; None for zeros (unknown) and for what is no covariance.
+
+    A covariance of rotations is about the fixed axes of the upright frame (REP 103), so the third is the heading's.
+    """
     return _sigma_of(np.asarray(covariance, np.float64).tobytes())
 
 
 @lru_cache(maxsize=64)
 def _sigma_of(covariance: bytes) -> float | None:
     """The same from the bytes of 9 float64, which most logs repeat in every message."""
-    matrix = np.frombuffer(covariance).reshape(3, 3)
-    if not np.isfinite(matrix).all():
-        return None
-    variance = float(np.mean(np.linalg.eigvalsh((matrix + matrix.T) / 2)[:2]))
-    return float(np.sqrt(variance)) if 0 < variance < MAX_STATED_SIGMA**2 else None
+    x, y, _ = np.frombuffer(covariance)[::4].tolist()
+    variance = (x + y) / 2
+    return min(math.sqrt(variance), MAX_STATED_SIGMA) if min(x, y) >= 0 and 0 < variance < math.inf else None
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from recordings.containers.time_range import EDGE_NS, MAX_LATENESS_NS, FramesInR
 from recordings.discovery.roles import TRANSFORMS
 from recordings.errors import LogError
 from recordings.inertial.up_estimator import LOOKAHEAD_NS, UpEstimator
+from recordings.ros2.tilt_from_msg import MAX_STATED_SIGMA
 from recordings.source.cameras import CAMERAS, CalibrationHistory
 from recordings.source.moving_mount import MAX_GAP_NS, MovingMount
 from recordings.source.resolution import SourceResolution
@@ -259,9 +260,23 @@ class McapLog(AbstractContextManager["McapLog"]):
         if any(self._schema(side) == VIDEO for side in CAMERAS):
             notes.append(("left", VIDEO_NOTE))
         notes += [*self.resolution.notes(self._estimator), ("odometry", self._clock_of_poses())]
+        notes.append(("inclinometer", self._unknown_tilt()))
         notes += [("left", note) for note in self.file.notes if "left" in self.topics]
         noted = dict.fromkeys(stream for stream, note in notes if note)
         return {stream: "; ".join(note for of, note in notes if of == stream and note) for stream in noted}
+
+    def _unknown_tilt(self) -> str:
+        """A note if the first message with a tilt states that it is unknown; else empty."""
+        if (tilt := self.resolution.tilt) is None or tilt.estimates:
+            return ""
+        read = tilt.readers(self.source)[tilt.topic]
+        made = self.resolution.messages.first(tilt.topic, lambda message: read(message, 0))
+        if not isinstance(made, Tilt) or (made.sigma or 0.0) < MAX_STATED_SIGMA:
+            return ""
+        return (
+            f"the covariance on {tilt.topic} states that roll and pitch are unknown, so common_variance of the map is "
+            "large; if the driver knows them, correct its covariance"
+        )
 
     def _clock_of_poses(self) -> str:
         """A note if the poses' stamps are of another clock than the images', with the setting; else empty."""

@@ -56,9 +56,11 @@ def test_a_stated_sigma_counts_unless_the_readings_show_a_larger_one():
 
 
 @pytest.mark.parametrize(("variances", "sigma"), [
-    ((1e-4, 1e-4, 3.0), 0.01), ((3.0, 1e-4, 1e-4), 0.01), ((0, 0, 0), None), ((np.nan, 1, 1), None), ((9,) * 3, None),
+    ((1e-4, 1e-4, 3.0), 0.01), ((1e-4, 1e-4, 0), 0.01), ((1e-4, 1e-4, 1e-6), 0.01), ((1e-4, 3e-4, 1), np.sqrt(2e-4)),
+    ((0.134, 0.134, 0.2), np.sqrt(0.134)), ((9,) * 3, np.pi / 2), ((1e6,) * 3, np.pi / 2), ((0, 0, 0), None),
+    ((np.nan, 1, 1), None), ((-2, 4, 1), None),
 ])  # fmt: skip
-def test_the_covariance_of_an_imu_states_the_sigma(variances, sigma):
+def test_the_covariance_of_an_imu_about_the_level_axes_states_the_sigma(variances, sigma):
     message = ros2.imu(5, "imu", np.array([0, 0, 0, 1.0]), np.diag(variances))
     assert tilt_of(message, 5).sigma == (None if sigma is None else pytest.approx(sigma))
 

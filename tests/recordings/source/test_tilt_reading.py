@@ -19,7 +19,7 @@ from recordings.inertial.up_estimator import UpEstimator
 from recordings.inventory.text import format_description
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
-from recordings.ros2.to_msg import header, odometry, quaternion, raw_imu, transform_message
+from recordings.ros2.to_msg import header, imu, odometry, quaternion, raw_imu, transform_message
 from recordings.source.settings import TimeOffsets
 from recordings.source.tilt_reading import TiltReading, estimated_tilts
 from stages.data import Pose, Tilt, Transform
@@ -295,6 +295,18 @@ def test_an_imu_without_rates_gives_the_direction_of_each_acceleration(tmp_path)
     tilts, _, note = read(path)
     assert driven.errors(tilts[:400]).max() < 0.5
     assert "right only at rest" in note
+
+
+@pytest.mark.parametrize(("variance", "noted"), [(0.2, False), (1e6, True)])
+def test_a_covariance_that_states_an_unknown_tilt_is_noted(tmp_path, variance, noted):
+    up = Rotation.from_euler("ZYX", [80, 4, -7], degrees=True).as_quat()
+
+    def unsure(number, stamp, rate, force):
+        return {IMU: imu(stamp, "imu_link", up, variance * np.eye(3))}
+
+    tilts, _, note = read(written(tmp_path / "log.mcap", drive(seconds=3), unsure))
+    assert tilts[-1].sigma == pytest.approx(min(np.sqrt(variance), np.pi / 2))
+    assert ("states that roll and pitch are unknown" in note) == noted
 
 
 def test_poses_in_an_upright_frame_are_tilts_where_a_setting_says_so(tmp_path):
