@@ -22,6 +22,7 @@ GROUND_SIGMA = float(np.deg2rad(8))  # rad, of the mean slope of the ground in v
 PARAMETER_COST = 4.0  # added to the score for each fitted number
 MIN_FRAMES = 8
 MIN_ANGLE = float(np.deg2rad(2.0))  # rad, of a mount error that is a fault
+MIN_SPREAD = float(np.deg2rad(0.5))  # rad, RMS of an axis's directions that show how quaternions are misread
 MIN_OFFSET = 0.08  # s, of a time offset that is a fault
 MAX_OFFSET, MAX_LARGE_OFFSET = 0.6, 3.0  # s, of the time offsets tried; the large ones if the tilt is not sound
 MAX_FRAME_GAP = 1.5  # s, for a time offset to be measurable
@@ -42,6 +43,18 @@ _UPSIDE_DOWN = {  # exchanged, signs of pitch and roll -> fault and remedy, wher
     (False, 1, -1): ("the signs of roll and up are flipped", _TURN.format(axis="x")),
     (False, -1, 1): ("the signs of pitch and up are flipped", _TURN.format(axis="y")),
 }
+_MISREAD = (  # fault, remedy, axis of the inclinometer whose direction in the world is read as up, and mirrored by
+    (
+        "the quaternions are inverse, from the world to the inclinometer's frame",
+        "They must rotate its frame into the world (REP 145). Negate x, y and z in the driver or the log.",
+        (0.0, 0.0, 1.0), np.eye(3),
+    ),
+    (
+        "the quaternions have w first",
+        "Their order must be x, y, z, w. Correct the driver or the log.",
+        (1.0, 0.0, 0.0), np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]),
+    ),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +68,8 @@ class Evidence:
     ups: Array  # (n, 3), in the inclinometer's frame
     mount: Array  # (3, 3), rotation from the inclinometer to the camera
     ground: Array  # (n, 3), upward normal of the ground in view, in the camera; NaN if unknown
+    sigma: float = float("nan")  # rad, of a tilt; NaN if unknown
+    estimated: bool = False  # from accelerations and rates
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +178,30 @@ def radians_as_degrees(fit: Fit) -> Cause | None:
     ups = np.column_stack([level, np.sqrt(rest)]) @ fit.evidence.mount.T
     remedy = "Check the unit of source.pitch and source.roll (rad, not deg), or the inclinometer's driver."
     return fit.cause("radians are taken for degrees", remedy, ups, 1)
+
+
+def misread_quaternions(fit: Fit) -> list[Cause]:
+    """Quaternions read in another convention: "up" is then the direction in the world of an axis of the inclinometer.
+
+    The camera's rotations show these directions but for the attitude of each segment's first frame, which is fitted.
+    There are no causes if these are too much alike for that.
+    """
+    evidence, found = fit.evidence, list[Cause]()
+    segments = np.unique(evidence.segments)
+    for fault, remedy, axis, mirror in _MISREAD:
+        seen = evidence.cameras @ (evidence.mount @ axis)  # in the first camera of the segment
+        read = evidence.ups @ mirror
+        residuals, ups, spread = np.empty_like(seen), np.empty_like(seen), 0.0
+        for inside in (evidence.segments == segment for segment in segments):
+            left, _, right = np.linalg.svd(read[inside].T @ seen[inside])
+            world = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+            residuals[inside] = read[inside] - seen[inside] @ world.T
+            ups[inside] = world[2] @ evidence.cameras[inside]
+            spread += float(np.sum(np.var(seen[inside], axis=0))) * np.count_nonzero(inside)
+        if spread > MIN_SPREAD**2 * len(seen):
+            misfit = float(np.sum(np.square(fit.operator @ residuals)))
+            found.append(Cause(fault, remedy, misfit, fit.slope(ups), 1 + len(segments)))
+    return found
 
 
 @cache

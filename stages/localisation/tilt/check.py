@@ -38,6 +38,8 @@ class _TiltSample:
     up: Array
     mount: Array
     ground: Array
+    sigma: float
+    estimated: bool
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ class CheckTilt(Stage):
         if motion.camera is not None:
             drift = max(float(np.trace(motion.covariance[3:, 3:])) / 3, 0.0)
             sample = _TiltSample(
-                motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground
+                motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground,
+                np.nan if tilt.sigma is None else tilt.sigma, tilt.filtered,
             )  # fmt: skip
             turn = _residual(sample, state.last)
             state.last = sample
@@ -153,12 +156,13 @@ def _finding(judged: Diagnosis, where: str = "") -> Finding:
 
 def _diagnosis(state: TiltMemory) -> Diagnosis:
     """The diagnosis of the frames kept, as if the camera stood still on the rover as it does in the last one."""
-    mount = state.kept[-1].mount
+    mount, estimated = state.kept[-1].mount, state.kept[-1].estimated
     stamps, segments, cameras, drift, ups, ground = (
         np.array(column)
         for column in zip(*((s.stamp, s.segment, *_as_mounted(s, mount)) for s in state.kept), strict=True)
     )
-    return diagnose(Evidence(stamps, segments, cameras, drift, ups, mount, ground))
+    sigma = float(np.median([sample.sigma for sample in state.kept]))
+    return diagnose(Evidence(stamps, segments, cameras, drift, ups, mount, ground, sigma, estimated))
 
 
 def _as_mounted(sample: _TiltSample, mount: Array) -> tuple[Array, float, Array, Array]:

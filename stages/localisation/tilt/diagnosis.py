@@ -17,6 +17,7 @@ from stages.localisation.tilt.causes import (
     GROUND_SIGMA,
     MAX_LARGE_OFFSET,
     MAX_OFFSET,
+    MIN_ANGLE,
     MIN_FRAMES,
     MIN_OFFSET,
     Cause,
@@ -25,6 +26,7 @@ from stages.localisation.tilt.causes import (
     degrees,
     exchanged_axes,
     late_stamps,
+    misread_quaternions,
     radians_as_degrees,
     wrong_mount,
 )
@@ -35,6 +37,8 @@ MAX_NOISE = float(np.deg2rad(2.0))  # rad; beyond it tilt and camera disagree, w
 MAX_SOUND_NOISE = float(np.deg2rad(0.5))  # rad; beyond it large time offsets are tried
 MAX_DELAY_NOISE = float(np.deg2rad(1.0))  # rad; a sound tilt of noise 0.6 degrees has less, and so has a late one
 MIN_DELAY_RATIO = 2.0  # of residuals without and with a large time offset; one of seconds fits any tilt a little
+MAX_SMALL_MOUNT = float(np.deg2rad(20))  # rad, of a mount error; a larger one explains a part of any fault, so it may
+MAX_MOUNT_SIGMAS, MAX_MOUNT_NOISE = 3.0, float(np.deg2rad(0.3))  # leave so many sigmas, or so much, rad
 MAX_SLOPE = float(np.deg2rad(20))  # rad; ground that is steeper in every frame means a wrong tilt
 MIN_GAIN = 25.0  # of a fault's score over that of no fault: five sigma
 MIN_RIVAL_GAIN = 10.0  # over the scores of other faults; those within it are named too
@@ -42,6 +46,10 @@ MAX_SAME = 0.3  # norm of the difference of two rotation matrices that are one f
 MAX_UNSEEN = 0.33  # standard deviation of a fault over the smallest that counts; beyond it a fault may go unseen
 MIN_SWING_RATIO, MIN_SWING = 4.0, float(np.deg2rad(4))  # of up over the camera's rotation, if the unit is wrong
 INCONSISTENT = "inconsistent"  # no single fault explains the tilt
+ESTIMATED = (
+    "The tilt is estimated from accelerations and rates. Check the axes, the signs and the unit (rad/s) of the "
+    "gyroscope, and that both sensors have the axes of their frames in /tf_static."
+)
 OFF_GROUND = "up is off the ground"  # the ground contradicts the tilt, and the motion does not show why
 
 
@@ -57,7 +65,7 @@ class Diagnosis:
 class _Hypotheses(NamedTuple):
     """All causes fitted to the evidence, with the noise, rad, that was assumed for the tilts."""
 
-    frames: int
+    evidence: Evidence
     degrees_of_freedom: int
     noise: float
     sound: Cause
@@ -65,10 +73,16 @@ class _Hypotheses(NamedTuple):
     mount: Cause
     offset: Cause | None
     units: Cause | None
+    quaternions: list[Cause]
+
+    @property
+    def frames(self) -> int:
+        return len(self.evidence.stamps)
 
     @property
     def faults(self) -> list[Cause]:
-        return [*self.axes, *(cause for cause in (self.units, self.mount, self.offset) if cause is not None)]
+        others = self.units, self.mount, self.offset
+        return [*self.axes, *self.quaternions, *(cause for cause in others if cause is not None)]
 
     @property
     def variance(self) -> float:
@@ -81,10 +95,13 @@ class _Hypotheses(NamedTuple):
         return float(self.noise * np.sqrt(cause.misfit / self.degrees_of_freedom))
 
     def explains(self, cause: Cause) -> bool:
-        """Whether tilt and camera agree well enough under a time offset to name it; true of other causes."""
+        """Whether tilt and camera agree well enough under a time offset or a large error of the mount to name it; true
+        of other causes."""
+        left = self.residual(cause)
+        if cause is self.mount and cause.size * MIN_ANGLE > MAX_SMALL_MOUNT:
+            return left <= max(MAX_MOUNT_NOISE, MAX_MOUNT_SIGMAS * self.evidence.sigma)  # which may be NaN
         if cause is not self.offset:
             return True
-        left = self.residual(cause)
         large = cause.size * MIN_OFFSET > MAX_OFFSET
         return left <= MAX_DELAY_NOISE and not (large and self.residual(self.sound) < MIN_DELAY_RATIO * left)
 
@@ -110,8 +127,9 @@ def _judged(evidence: Evidence, degrees_of_freedom: int, noise: float) -> tuple[
     fit = Fit(evidence, noise)
     sound = fit.cause("", "", fit.ups)
     tried = _Hypotheses(
-        len(evidence.stamps), degrees_of_freedom, noise, sound, exchanged_axes(fit), wrong_mount(fit),
+        evidence, degrees_of_freedom, noise, sound, exchanged_axes(fit), wrong_mount(fit),
         late_stamps(fit, sound, MAX_OFFSET), radians_as_degrees(fit),
+        [] if evidence.estimated else misread_quaternions(fit),
     )  # fmt: skip
     if tried.residual(sound) > MAX_SOUND_NOISE:
         offsets = [cause for cause in (tried.offset, late_stamps(fit, sound, MAX_LARGE_OFFSET)) if cause is not None]
@@ -150,6 +168,8 @@ def _faulty(tried: _Hypotheses, best: Cause) -> Diagnosis:
     rivals = [rival for rival in rivals if tried.explains(rival)]
     faults = [best.fault, *(rival.fault for rival in rivals if not _same(best, rival))]
     remedy = best.remedy
+    if tried.evidence.estimated and best in (*tried.axes, tried.units):
+        remedy = ESTIMATED
     if best is tried.mount and tried.offset is None:
         faults.insert(1, "its stamps are late or early")
         remedy = (
@@ -173,9 +193,14 @@ def _agreement(tried: _Hypotheses, best: Cause) -> str:
 
 
 def _inconsistent(tried: _Hypotheses) -> Diagnosis:
+    likely = (
+        "the axes, signs and units of gyroscope and accelerometer, their clock"
+        if tried.evidence.estimated
+        else "its axes, unit, mount and clock, the convention of its quaternions"
+    )
     sentence = (
         f"Tilt and camera disagree by {degrees(tried.residual(tried.sound))} ({tried.frames} frames), and no single "
-        "fault of the inclinometer explains it. Check its axes, unit, mount and clock, and whether it is shaken."
+        f"fault of the inclinometer explains it, so no remedy is known. Check {likely}, and whether it is shaken."
     )
     return Diagnosis(INCONSISTENT, sentence, True)
 

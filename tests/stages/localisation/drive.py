@@ -47,15 +47,18 @@ class Drive:
         """camera <- inclinometer."""
         return self.truth.mounts[0].rotation.T @ self.truth.mounts[2].rotation  # type: ignore[no-any-return]
 
-    def ups(self, frames: int = FRAMES, late: float = 0.0) -> Array:
-        """Readings of the inclinometer at the frames, with stamps too late by `late` seconds."""
+    def orientations(self, frames: int = FRAMES, late: float = 0.0) -> Array:
+        """world <- inclinometer at the frames, (n, 3, 3), as it measures it with stamps too late by `late` seconds."""
         rng, spread = np.random.default_rng([self.seed, 1]), np.radians(self.noise) * SMOOTHED
         found = []
         for stamp in self.stamps(frames):
             turned = self.truth.base_at(stamp - round(late * 1e9)).rotation @ self.truth.mounts[2].rotation
-            wobble = Rotation.from_rotvec([*rng.normal(0, spread, 2), 0.0]).as_matrix()
-            found.append(turned.T @ wobble.T[:, 2])
+            found.append(Rotation.from_rotvec([*rng.normal(0, spread, 2), 0.0]).as_matrix() @ turned)
         return np.array(found)
+
+    def ups(self, frames: int = FRAMES, late: float = 0.0) -> Array:
+        """Readings of the inclinometer at the frames, with stamps too late by `late` seconds."""
+        return self.orientations(frames, late)[:, 2]
 
     def turns(self, frames: int = FRAMES) -> Array:
         """Rotation of the camera since the first frame by visual odometry, (n, 3, 3)."""

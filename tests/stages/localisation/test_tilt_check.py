@@ -57,6 +57,14 @@ def test_a_flipped_sign_is_found_within_30_frames_and_reported_at_the_end():
     assert stage.finding() == stage.finding()  # asking changes nothing
 
 
+@pytest.mark.parametrize(("filtered", "remedy"), [(False, "source.pitch.sign"), (True, "of the gyroscope")])
+def test_an_estimated_tilt_has_a_remedy_of_its_own(filtered, remedy):
+    flip, stage = flipped(0), Running(CheckTilt())
+    for motion, tilt in readings(DRIVE):
+        stage(motion, Tilt(motion.stamp, flip(tilt.up), sigma=0.003, filtered=filtered), MOUNT)
+    assert remedy in stage.finding().sentence
+
+
 @pytest.mark.parametrize(("late", "fault"), [(0, ""), (5, "the mount of the inclinometer is wrong")])
 def test_a_camera_that_pans_is_judged_by_its_mount_in_each_frame(late, fault):
     """late: frames by which the mounts lag behind the pan; at 0.2 rad a frame the camera is then elsewhere."""

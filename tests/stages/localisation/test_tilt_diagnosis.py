@@ -81,6 +81,42 @@ def test_a_tilt_that_is_upside_down_is_named_with_the_frame_to_correct(signs, fa
     assert "source." not in found.sentence
 
 
+def misread(drive: Drive, order: list[int], signs: list[int], heading: float) -> Evidence:
+    """Evidence of orientations whose quaternion's numbers have another order and other signs."""
+    true = Rotation.from_euler("z", heading) * Rotation.from_matrix(drive.orientations())
+    return replace(drive.evidence(), ups=Rotation.from_quat(true.as_quat()[:, order] * signs).as_matrix()[:, 2])
+
+
+INVERSE, W_FIRST = ([0, 1, 2, 3], [-1, -1, -1, 1]), ([3, 0, 1, 2], [1, 1, 1, 1])
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+@pytest.mark.parametrize("heading", [0.0, 0.7, 2.0])
+@pytest.mark.parametrize(("read", "fault"), [
+    (INVERSE, "the quaternions are inverse, from the world to the inclinometer's frame"),
+    (W_FIRST, "the quaternions have w first"),
+])  # fmt: skip
+def test_quaternions_of_another_convention_are_named_at_any_heading(drive, heading, read, fault):
+    found = diagnose(misread(drive, *read, heading))
+    assert found.fault == fault, found.sentence
+    assert "source." not in found.sentence
+
+
+@pytest.mark.parametrize("order", [[0, 2, 1, 3], [1, 0, 2, 3]])
+def test_a_large_rotation_that_leaves_more_than_noise_is_no_wrong_mount(order):
+    found = diagnose(misread(DRIVES[0], order, [1, 1, 1, 1], 0.7))
+    assert found.fault == "inconsistent", found.sentence
+    assert "no remedy is known" in found.sentence
+    assert "source." not in found.sentence
+
+
+@pytest.mark.parametrize("change", [flipped(0), exchanged, radians_as_degrees])
+def test_the_remedy_of_an_estimated_tilt_is_its_gyroscope(change):
+    found = diagnose(replace(DRIVES[0].evidence(change=change), estimated=True))
+    assert "Check the axes, the signs and the unit (rad/s) of the gyroscope" in found.sentence
+    assert "source." not in found.sentence
+
+
 def test_the_ground_separates_up_from_down_and_the_sentence_names_it():
     found = diagnose(DRIVES[0].evidence(change=lambda up: -up))
     ground = r"Without this fault the ground in view is \d\.\d+ degrees off level on average, with it overhead \("
