@@ -6,6 +6,12 @@ gyroscope and a of the accelerometer, in the sensor's frame. With C the rotation
     ds/dt = C (b - bias used) x s + noise        mean acceleration = s + mean C a + disturbance
 
 So the model is nearly linear and no heading is needed. The length of s is part of the state: gravity is measured.
+At rest the disturbance is small, so accelerations that turn show a rate across gravity. A steady turn about gravity
+looks like rest and a bias. So, unless it is slower than any rover turns, the state contains a rate t, whose sigma is
+the rate measured when the rest begins:
+
+    rate about gravity = b about gravity + t + noise        at rest
+
 The smoother is that of Rauch, Tung and Striebel (1965).
 """
 
@@ -15,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recordings.inertial.blocks import BLOCK_NS, Blocks
+from recordings.inertial.blocks import BLOCK_NS, MAX_REST_RATE_STD, Blocks
 from stages.data import Array
 from stages.data.covariance import cross_matrix
 
@@ -23,9 +29,11 @@ from stages.data.covariance import cross_matrix
 GYROSCOPE_NOISE = 5e-4
 GYROSCOPE_SCALE = 0.005  # share of an angle
 GYROSCOPE_BIAS_SIGMA = 0.1
+GYROSCOPE_RESTART_SIGMA = 0.02  # of the change of a bias if the sensor was off
 GYROSCOPE_BIAS_WALK = 2e-5
 ACCELEROMETER_BIAS_WALK = 1e-4
 REST_RATE_SIGMA = 5e-4  # of a mean rate at rest: instability of the bias, and the planet's own rotation
+MIN_TURN = 0.01  # of a rover; a smaller mean rate at rest is a bias about all axes
 REST_SIGMA = 0.005  # of a mean acceleration at rest
 MIN_DISTURBANCE = 0.02**2  # (m/s^2)^2/Hz, of a sensor that moves
 START_SIGMA = 0.5  # of gravity before the first block
@@ -36,12 +44,13 @@ DISTURBANCE_BLOCKS = 100  # over which the disturbance is measured
 DISTURBANCE_SPANS = (1, 2, 4, 8, 16)  # blocks
 MAX_SURPRISE = 3.0  # sigmas; a block that is farther off counts less
 
-S, B, A = slice(0, 3), slice(3, 6), slice(6, 9)
+S, B, A, T = slice(0, 3), slice(3, 6), slice(6, 9), 9
+SIZE = 10
 
 
 @dataclass(frozen=True)
 class GravityState:
-    """Mean (9,) and covariance (9, 9)."""
+    """Mean (10,) and covariance (10, 10)."""
 
     mean: Array
     covariance: Array
@@ -49,31 +58,36 @@ class GravityState:
 
 @dataclass(frozen=True)
 class FilterStep:
-    """One block: the transition (9, 9) to it, the state predicted, and the state with its measurements."""
+    """One block: the transition (10, 10) to it, the state predicted, the state with its measurements, and whether the
+    sensor is at rest."""
 
     transition: Array
     predicted: GravityState
     updated: GravityState
+    rest: bool
 
 
-def first_state(force: Array, bias: Array, accelerometer_bias: float, gravity: float | None) -> GravityState:
-    """The state before the first block; force: (3,) m/s^2 of the first accelerations; bias: (3,) rad/s; gravity: its
-    magnitude, if it is known."""
+def first_state(force: Array, accelerometer_bias: float, gravity: float | None) -> GravityState:
+    """The state before the first block; force: (3,) m/s^2 of the first accelerations; gravity: its magnitude, if it is
+    known."""
     up = force / np.linalg.norm(force)
-    covariance: Array = np.diag(np.repeat([START_SIGMA**2, GYROSCOPE_BIAS_SIGMA**2, accelerometer_bias**2], 3))
+    variances = np.repeat([START_SIGMA**2, GYROSCOPE_BIAS_SIGMA**2, accelerometer_bias**2], 3)
+    covariance: Array = np.diag([*variances, 0.0])
     if gravity is not None:
         covariance[S, S] -= (START_SIGMA**2 - GIVEN_GRAVITY_SIGMA**2) * np.outer(up, up)
-    return GravityState(np.concatenate([force if gravity is None else gravity * up, bias, np.zeros(3)]), covariance)
+    return GravityState(np.concatenate([force if gravity is None else gravity * up, np.zeros(SIZE - 3)]), covariance)
 
 
 def restarted(state: GravityState, force: Array, seconds: float, gravity: float | None) -> GravityState:
-    """The state after a gap of `seconds`: gravity is new in a new frame, the biases have drifted.
+    """The state after a gap of `seconds`: gravity is new in a new frame, the biases have drifted or, of the gyroscope,
+    changed with a restart of the sensor.
 
     force, gravity: as of `first_state`.
     """
-    first = first_state(force, state.mean[B], 0.0, gravity)
+    first = first_state(force, 0.0, gravity)
     covariance = first.covariance
-    covariance[B, B] = state.covariance[B, B] + GYROSCOPE_BIAS_WALK**2 * seconds * np.eye(3)
+    drift = GYROSCOPE_RESTART_SIGMA**2 + GYROSCOPE_BIAS_WALK**2 * seconds
+    covariance[B, B] = state.covariance[B, B] + drift * np.eye(3)
     covariance[A, A] = state.covariance[A, A] + ACCELEROMETER_BIAS_WALK**2 * seconds * np.eye(3)
     return GravityState(np.concatenate([first.mean[S], state.mean[3:]]), covariance)
 
@@ -102,29 +116,41 @@ def disturbance(forces: Array) -> float:
 
 def is_rest(blocks: Blocks, at: int, state: GravityState) -> bool:
     """Whether a block is at rest: it hardly varies, and its mean rate may be the gyroscope's bias."""
-    turning = float(np.linalg.norm(blocks.rate[at] - state.mean[B]))
-    doubt = float(np.sqrt(np.trace(state.covariance[B, B])))
-    return bool(blocks.still[at]) and turning < 3 * doubt + 6 * REST_RATE_SIGMA
+    spread = state.covariance[B, B] + _rate_variance(blocks, at) * np.eye(3)
+    return bool(blocks.still[at]) and _surprise(blocks.rate[at] - state.mean[B], spread) < MAX_SURPRISE**2
 
 
-def advance(state: GravityState, blocks: Blocks, at: int, bias: Array, density: float) -> tuple[FilterStep, bool]:
-    """The step over block `at`, integrated with the gyroscope's bias `bias`, and whether it is at rest.
+def advance(state: GravityState, blocks: Blocks, at: int, bias: Array, density: float, resting: bool) -> FilterStep:
+    """The step over block `at`, integrated with the gyroscope's bias `bias`.
 
-    density: the disturbance in motion, (m/s^2)^2/Hz.
+    density: the disturbance in motion, (m/s^2)^2/Hz; resting: whether the block before is at rest.
     """
-    predicted, transition = _predicted(state, blocks, at, bias)
+    up = blocks.axes[at].T @ state.mean[S] / np.linalg.norm(state.mean[S])
+    rate = float(up @ blocks.rate[at]) if np.isfinite(up).all() else 0.0
+    predicted, transition = _predicted(state, blocks, at, bias, None if resting else rate)
     rest, updated = is_rest(blocks, at, predicted), predicted
     if np.isfinite(blocks.force[at]).all():
-        model = np.hstack([np.eye(3), np.zeros((3, 3)), blocks.axes[at]])
+        model = np.hstack([np.eye(3), np.zeros((3, 3)), blocks.axes[at], np.zeros((3, 1))])
         if rest:
             variance = REST_SIGMA**2 + blocks.shaking[at] ** 2 / 3 / blocks.samples[at]
         else:
             variance = density / max(blocks.seconds[at], 1e-3)
         updated = _updated(updated, model, blocks.force[at], variance)
-    if rest:
-        model = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 3))])
-        updated = _updated(updated, model, blocks.rate[at], REST_RATE_SIGMA**2 + 1e-4 / 3 / blocks.samples[at])
-    return FilterStep(transition, predicted, updated), rest
+        if rest and np.linalg.norm(blocks.rate[at]) < MIN_TURN:
+            model = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 4))])
+            updated = _updated(updated, model, blocks.rate[at], _rate_variance(blocks, at))
+        elif rest:
+            model = np.concatenate([np.zeros(3), up, np.zeros(3), [1.0]])[None]
+            updated = _updated(updated, model, np.array([rate]), _rate_variance(blocks, at))
+    return FilterStep(transition, predicted, updated, rest)
+
+
+def filtered(first: FilterStep, blocks: Blocks, bias: Array, density: float) -> list[FilterStep]:
+    """The steps over blocks after `first`; bias, density: as of `advance`."""
+    steps = [first]
+    for at in range(len(blocks)):
+        steps.append(advance(steps[-1].updated, blocks, at, bias, density, steps[-1].rest))
+    return steps[1:]
 
 
 def smoothed(steps: list[FilterStep]) -> list[GravityState]:
@@ -148,30 +174,45 @@ def sigma_of(state: GravityState) -> float:
     return float(np.sqrt(max(variance, 0.0) / 2)) / length
 
 
-def _predicted(state: GravityState, blocks: Blocks, at: int, bias: Array) -> tuple[GravityState, Array]:
+def _predicted(
+    state: GravityState, blocks: Blocks, at: int, bias: Array, turn: float | None
+) -> tuple[GravityState, Array]:
+    """The state and the transition to it; turn: rad/s, about gravity, of a rest that may begin, None within one."""
     force, seconds = state.mean[S], blocks.seconds[at]
     drift = blocks.turned[at] @ (state.mean[B] - bias)
-    transition = np.eye(9)
+    transition = np.eye(SIZE)
     transition[S, S] += cross_matrix(drift)
     transition[S, B] = -cross_matrix(force) @ blocks.turned[at]
     mean = state.mean.copy()
     mean[S] += np.cross(drift, force)
-    noise = np.zeros((9, 9))
+    noise = np.zeros((SIZE, SIZE))
+    if turn is not None:
+        mean[T] = transition[T, T] = 0.0
+        noise[T, T] = turn**2
     across = float(force @ force) * np.eye(3) - np.outer(force, force)
     noise[S, S] = (GYROSCOPE_NOISE**2 * seconds + (GYROSCOPE_SCALE * blocks.angle[at]) ** 2) * across
     noise[B, B] = GYROSCOPE_BIAS_WALK**2 * seconds * np.eye(3)
     noise[A, A] = ACCELEROMETER_BIAS_WALK**2 * seconds * np.eye(3)
-    noise += 1e-12 * np.eye(9)
+    noise += 1e-12 * np.eye(SIZE)
     return GravityState(mean, transition @ state.covariance @ transition.T + noise), transition
 
 
+def _rate_variance(blocks: Blocks, at: int) -> float:
+    """Of the mean rate of a block at rest, (rad/s)^2, about each axis."""
+    return REST_RATE_SIGMA**2 + MAX_REST_RATE_STD**2 / 3 / float(blocks.samples[at])
+
+
+def _surprise(off: Array, spread: Array) -> float:
+    """The mean square of `off` in sigmas, by its covariance."""
+    return float(off @ np.linalg.solve(spread, off)) / len(off)
+
+
 def _updated(state: GravityState, model: Array, measured: Array, variance: float) -> GravityState:
-    """The state with one measurement (3,) of isotropic variance, which grows where the measurement is a surprise."""
-    off = measured - model @ state.mean
+    """The state with one measurement (k,) of isotropic variance, which grows where the measurement is a surprise."""
+    off, every = measured - model @ state.mean, np.eye(len(measured))
     spread = model @ state.covariance @ model.T
-    surprise = float(off @ np.linalg.solve(spread + variance * np.eye(3), off)) / 3
-    noise = variance * max(surprise / MAX_SURPRISE**2, 1.0) * np.eye(3)
+    noise = variance * max(_surprise(off, spread + variance * every) / MAX_SURPRISE**2, 1.0) * every
     gain = np.linalg.solve(spread + noise, model @ state.covariance).T
-    rest = np.eye(9) - gain @ model
+    rest = np.eye(SIZE) - gain @ model
     covariance = rest @ state.covariance @ rest.T + gain @ noise @ gain.T
     return GravityState(state.mean + gain @ off, (covariance + covariance.T) / 2)

@@ -13,10 +13,11 @@ import numpy as np
 from recordings.inertial.blocks import BLOCK_NS, Blocks, InertialSample, Knot, integrate
 from recordings.inertial.gravity_filter import (
     DISTURBANCE_BLOCKS,
+    SIZE,
     FilterStep,
     GravityState,
-    advance,
     disturbance,
+    filtered,
     first_state,
     restarted,
     sigma_of,
@@ -30,6 +31,7 @@ FIRST_LAG_BLOCKS = 150  # after the first tilt, unless the sensor is at rest at 
 LOOKAHEAD_NS = BATCH_NS + LAG_BLOCKS * BLOCK_NS
 MAX_GAP_NS = 500_000_000  # without a rate; a new estimate begins after a longer time
 MIN_TILT_INTERVAL_NS = 9_000_000
+FIRST_PASSES = 3  # over the first batch
 START_BLOCKS = 5  # whose mean acceleration is the first guess of gravity
 SPAN_BLOCKS = 5  # whose mean accelerations are compared with the rates
 MIN_COMPARED = 20  # of these spans
@@ -108,15 +110,15 @@ class UpEstimator:
         if self._knot is None:
             before, first = self._knot_before(samples), self._state
             self._origin = before.stamp
-            blocks, _ = integrate(samples, before, bias, self._origin)
-            if first is None and blocks.still.any():
-                bias = blocks.rate[blocks.still].mean(axis=0)
+            for _ in range(FIRST_PASSES):  # each with the bias that the one before found
                 blocks, _ = integrate(samples, before, bias, self._origin)
-            started = self._started(blocks, bias, first)
-            if started is None:
-                return
-            self._knot, self._state = before, started
-            self._steps = [FilterStep(np.eye(9), started, started)]
+                started = self._started(blocks, first)
+                if started is None:
+                    return
+                begin = FilterStep(np.eye(SIZE), started, started, rest=False)
+                steps = filtered(begin, blocks, bias, disturbance(self._in_motion(blocks)))
+                bias = steps[-1].updated.mean[3:6]
+            self._knot, self._steps = before, [begin]
         blocks, self._knot = integrate(samples, self._knot, bias, self._origin)
         self._filter(blocks, bias)
         self._blocks = blocks if self._blocks is None else self._blocks.then(blocks)
@@ -127,7 +129,7 @@ class UpEstimator:
         rate = next(sample.rate for sample in samples if sample.rate is not None)
         return Knot(samples[0].stamp - 1, np.array(rate), np.eye(3))
 
-    def _started(self, blocks: Blocks, bias: Array, before: GravityState | None) -> GravityState | None:
+    def _started(self, blocks: Blocks, before: GravityState | None) -> GravityState | None:
         """The state before the first batch; None where it has no accelerations. before: the state before a gap."""
         forces = blocks.force[np.isfinite(blocks.force).all(axis=1)][:START_BLOCKS]
         if not len(forces) or not np.linalg.norm(forces.mean(axis=0)) > 0:
@@ -135,24 +137,25 @@ class UpEstimator:
         force = forces.mean(axis=0)
         if before is not None:
             return restarted(before, force, (self._origin - self._ended) / 1e9, self.gravity)
-        return first_state(force, bias, self.accelerometer_bias, self.gravity)
+        return first_state(force, self.accelerometer_bias, self.gravity)
 
     def _filter(self, blocks: Blocks, bias: Array) -> None:
-        assert self._state is not None
-        moving = blocks.force[~blocks.still & np.isfinite(blocks.force).all(axis=1)]
-        self._forces = np.concatenate([self._forces, moving])[-DISTURBANCE_BLOCKS:]
-        density = disturbance(self._forces)
-        for at in range(len(blocks)):
-            step, rest = advance(self._state, blocks, at, bias, density)
-            self._state = step.updated
-            self._steps.append(step)
-            self.seconds += float(blocks.seconds[at])
-            self.rest_seconds += rest * float(blocks.seconds[at])
+        self._forces = self._in_motion(blocks)
+        steps = filtered(self._steps[-1], blocks, bias, disturbance(self._forces))
+        self._state = steps[-1].updated
+        self._steps += steps
+        self.seconds += float(blocks.seconds.sum())
+        self.rest_seconds += float(blocks.seconds[[step.rest for step in steps]].sum())
         self._compare(blocks)
         force = blocks.force[np.isfinite(blocks.force).all(axis=1)]
         if len(force):
             weight = float(blocks.seconds.sum()) / self.seconds
             self.measured_gravity += weight * (float(np.linalg.norm(force.mean(axis=0))) - self.measured_gravity)
+
+    def _in_motion(self, blocks: Blocks) -> Array:
+        """The mean accelerations of the last blocks in motion up to these."""
+        moving = blocks.force[~blocks.still & np.isfinite(blocks.force).all(axis=1)]
+        return np.concatenate([self._forces, moving])[-DISTURBANCE_BLOCKS:]
 
     def _compare(self, blocks: Blocks) -> None:
         """Add the variances of mean accelerations, over that of gravity: in the sensor's frame, in the gyroscope's, and

@@ -34,8 +34,11 @@ class Drive:
 
 
 def drive(seconds=60, rate=100, seed=1, rest=5.0, gravity=9.81, speed=0.5, gyroscope_bias=0.0035,
-          accelerometer_bias=0.0, vibration=0.5):  # fmt: skip
-    """A drive after some seconds of rest. The biases are standard deviations; noise is that of an Xsens MTi-10."""
+          accelerometer_bias=0.0, vibration=0.5, spin=0.0, slope=0.0):  # fmt: skip
+    """A drive after some seconds of rest. The biases are standard deviations; noise is that of an Xsens MTi-10.
+
+    spin: rad/s, on the spot in place of rest; slope: deg, of the ground.
+    """
     rng = np.random.default_rng(seed)
     times = np.arange(0, seconds, 1 / rate)
     going = np.clip(times - rest, 0, 1)
@@ -48,7 +51,9 @@ def drive(seconds=60, rate=100, seed=1, rest=5.0, gravity=9.81, speed=0.5, gyros
         return found * going
 
     heading = 0.35 * np.sin(2 * np.pi * np.cumsum(going) / rate * speed / 9)
-    attitude = Rotation.from_euler("ZYX", np.column_stack([heading, sway(), sway()]))
+    heading += spin * np.minimum(times, rest)
+    swaying = Rotation.from_euler("ZYX", np.column_stack([heading, sway(), sway()]))
+    attitude = Rotation.from_euler("y", slope, degrees=True) * swaying
     turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() * rate
     rates = np.vstack([turns[:1], turns])
     velocity = attitude.apply([1, 0, 0]) * (speed * going)[:, None]

@@ -48,6 +48,14 @@ def test_up_is_right_at_rest_and_while_driving(changes, largest, first):
     assert 0.2 < rms(judged) < 1.2  # of the stated sigma
 
 
+@pytest.mark.parametrize(("spin", "slope"), [(0.2, 0), *slow((0.05, 10), (0.1, 10), (0.2, 10))])
+def test_a_steady_turn_on_the_spot_is_no_bias_of_the_gyroscope(spin, slope):
+    driven = drive(seconds=30, rest=10.0, spin=spin, slope=slope, vibration=0.1)
+    tilts, estimator = estimated(driven.samples())
+    assert rms(driven.errors(tilts)) < 0.2
+    assert not estimator.contradicts
+
+
 def test_a_known_gravity_shows_the_bias_along_it():
     driven = drive(rest=60.0)
     driven.forces[:] += [0.0, 0.0, 0.05]
@@ -74,6 +82,16 @@ def test_a_new_estimate_after_a_gap_keeps_the_biases():
     assert not any(samples[4000].stamp <= tilt.stamp < samples[4500].stamp for tilt in tilts)
     after = driven.errors(tilts)[4000:]
     assert rms(after) < 0.3
+
+
+@pytest.mark.parametrize("rest", [5.0, 50.0])
+def test_a_gyroscope_may_restart_with_another_bias_in_a_gap(rest):
+    driven = drive(seconds=60, rest=rest)
+    driven.rates[2500:] += np.radians([1, -1, 1])
+    samples = driven.samples()
+    tilts, estimator = estimated(samples[:2000] + samples[2500:])
+    assert rms(driven.errors(tilts)[2000:]) < 0.3
+    assert estimator.rest_seconds > rest - 7
 
 
 def test_a_long_gap_leaves_doubt_about_the_gyroscope_and_none_about_a_known_gravity():
