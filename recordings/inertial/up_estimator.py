@@ -36,6 +36,9 @@ START_BLOCKS = 5  # whose mean acceleration is the first guess of gravity
 SPAN_BLOCKS = 5  # whose mean accelerations are compared with the rates
 MIN_COMPARED = 20  # of these spans
 MIN_TURNED = float(np.radians(1.0))  # RMS of the turns that the rates show within a batch
+MAX_BIASES = 3.0  # sigmas of the accelerometer's bias, by which measured gravity may differ from the given one
+MAX_GRAVITY_SHARE = 0.03  # of gravity, in addition: the accelerometer's scale, and the motion
+MAX_SPIKE = 0.5  # of gravity, by which a block's mean acceleration may differ from the median
 MIN_EXPLAINED = 0.3  # share of these turns that accelerations confirm; near 1 for a sound sensor, else below 0
 
 
@@ -44,7 +47,8 @@ class UpEstimator:
     """Estimates up from samples in the order of stamps; `push` and `finish` return tilts as they become final.
 
     accelerometer_bias: standard deviation of each axis, m/s^2; gravity: its magnitude, m/s^2, None if it is to be
-    measured. rest_seconds, seconds: time at rest, and in all; measured_gravity: mean magnitude of batches, m/s^2.
+    measured. rest_seconds, seconds: time at rest, and in all; measured_gravity: mean magnitude of batches, m/s^2,
+    without blocks of spikes.
     """
 
     frame_id: str
@@ -85,6 +89,16 @@ class UpEstimator:
         spans, own, turned, predicted = self._compared
         clear = spans >= MIN_COMPARED and predicted > MIN_TURNED**2 * spans
         return bool(clear and own - turned < MIN_EXPLAINED * predicted)
+
+    @property
+    def contradicts_gravity(self) -> bool:
+        """Whether measured gravity differs from the given one by more than the accelerometer's errors explain. Rates
+        that are wrong make it too small."""
+        if self.gravity is None or not self.seconds:
+            return False
+        explained = MAX_BIASES * self.accelerometer_bias + MAX_GRAVITY_SHARE * self.gravity
+        excess = self.measured_gravity - self.gravity
+        return excess > explained or (excess < -explained and not self.contradicts)
 
     def finish(self) -> list[Tilt]:
         """The tilts of all samples so far; a new estimate then begins."""
@@ -148,6 +162,8 @@ class UpEstimator:
         self.rest_seconds += float(blocks.seconds[[step.rest for step in steps]].sum())
         self._compare(blocks)
         force = blocks.force[np.isfinite(blocks.force).all(axis=1)]
+        middle = np.median(force, axis=0) if len(force) else np.zeros(3)
+        force = force[np.linalg.norm(force - middle, axis=1) < MAX_SPIKE * np.linalg.norm(middle)]
         if len(force):
             weight = float(blocks.seconds.sum()) / self.seconds
             self.measured_gravity += weight * (float(np.linalg.norm(force.mean(axis=0))) - self.measured_gravity)

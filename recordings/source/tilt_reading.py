@@ -113,10 +113,7 @@ class TiltReading:
         said = f"the tilt is estimated from the {parts}{because}{self._lag(settings)}"
         if estimator is None or not estimator.seconds:
             return said
-        return (
-            f"{said}; at rest for {estimator.rest_seconds:.0f} of {estimator.seconds:.0f} s; "
-            f"{_gravity(estimator.measured_gravity, settings.gravity)}"
-        )
+        return f"{said}; at rest for {estimator.rest_seconds:.0f} of {estimator.seconds:.0f} s; {_gravity(estimator)}"
 
     def _lag(self, settings: LogSettings) -> str:
         """What is unusual about the times at which accelerations and rates are logged."""
@@ -130,14 +127,21 @@ class TiltReading:
 
     def fault(self, estimator: UpEstimator) -> Finding | None:
         """A fault of the sensors that the samples show, after a run."""
-        if not estimator.contradicts:
+        if estimator.contradicts_gravity:
+            unit = ", and its unit is m/s2, not g" if estimator.gravity == 1 else ""
+            sentence = (
+                f"Gravity is {estimator.measured_gravity:.2f} m/s2 by the accelerations on {self.topic}, so the "
+                f"estimated tilt is wrong: 'gravity' of the source is {estimator.gravity:g}{unit}. Correct it, or "
+                "leave it out."
+            )
+        elif estimator.contradicts:
+            sentence = (
+                f"The rates on {self.gyroscope} contradict the accelerations on {self.topic}, so the estimated tilt "
+                "is wrong. Check the axes, the signs and the unit (rad/s) of the gyroscope."
+            )
+        else:
             return None
-        return Finding(
-            f"The rates on {self.gyroscope} contradict the accelerations on {self.topic}, so the estimated tilt "
-            "is wrong. Check the axes, the signs and the unit (rad/s) of the gyroscope.",
-            Severity.FAULT,
-            about="tilt",
-        )
+        return Finding(sentence, Severity.FAULT, about="tilt")
 
 
 def rates_corrected(lag: int, settings: LogSettings) -> str:
@@ -146,8 +150,9 @@ def rates_corrected(lag: int, settings: LogSettings) -> str:
     return f"--set source.time_offset.gyroscope={offset / 1e9:.3f}s corrects the rates"
 
 
-def _gravity(measured: float, given: float | None) -> str:
+def _gravity(estimator: UpEstimator) -> str:
     """The measured magnitude of gravity, compared with that of the settings or of a planet."""
+    measured, given = estimator.measured_gravity, estimator.gravity
     found = f"gravity is {measured:.2f} m/s2"
     if given is not None:
         differs = abs(measured / given - 1) > GRAVITY_RTOL

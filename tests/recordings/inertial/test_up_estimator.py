@@ -126,6 +126,12 @@ def test_memory_does_not_grow_with_the_log(rates_until):
     assert most < 50 * 40
 
 
+def test_spikes_of_accelerations_do_not_change_the_measured_gravity():
+    driven = drive(seconds=20)
+    driven.forces[::97] += [0, 0, 160]
+    assert estimated(driven.samples())[1].measured_gravity == pytest.approx(9.81, rel=0.02)
+
+
 def test_samples_without_accelerations_give_no_tilt():
     assert estimated([InertialSample(stamp, (0.0, 0.0, 0.0), None) for stamp in range(0, 10**10, 10**7)])[0] == []
 

@@ -184,6 +184,27 @@ def test_samples_of_another_sensor_on_the_topic_are_lost(tmp_path):
     assert f"{IMU} contains messages of several sensors (in the frames 'imu_link', 'rear_link')" in why
 
 
+@pytest.mark.parametrize(("gravity", "unit"), [(9.81, None), (1.62, ""), (1.0, ", and its unit is m/s2, not g")])
+def test_a_gravity_that_the_accelerations_contradict_is_a_fault(tmp_path, gravity, unit):
+    with McapSource(gravity=gravity).open(written(tmp_path / "log.mcap", drive(seconds=12))) as log:
+        assert len(list(log.events())) > 1000
+        found = log.faults().get("inclinometer")
+    if unit is None:
+        assert found is None
+        return
+    assert (found.severity, found.about) == (Severity.FAULT, "tilt")
+    assert found.sentence.startswith(f"Gravity is 9.79 m/s2 by the accelerations on {IMU}, ")
+    assert f"'gravity' of the source is {gravity:g}{unit}. Correct it, or leave it out." in found.sentence
+
+
+def split(number, stamp, rate, force):
+    """Accelerations and rates on two topics, of two frames, as of a RealSense."""
+    gyroscope = Rotation.from_euler("z", -90, degrees=True).apply(rate)
+    rates = raw_imu(stamp, "gyro_link", gyroscope, np.zeros(3))
+    accelerations = raw_imu(stamp + 2_000_000, "imu_link", np.zeros(3), force)
+    return {"/camera/gyro/sample": rates} | ({"/camera/accel/sample": accelerations} if number % 2 else {})
+
+
 def test_tilts_and_losses_do_not_wait_for_the_end_of_a_log_of_losses():
     driven, second = drive(seconds=8), 10**9
     end = int(driven.stamps[-1])
