@@ -16,6 +16,7 @@ from stages.data.rotations import nearest_rotation
 
 BLOCK_NS = 200_000_000
 REST_BLOCKS = 2  # to both sides of a block, which must be at rest as well
+REST_MEANS = 20  # of a block's samples, whose spread counts; noise grows with the rate of samples
 MAX_REST_RATE_STD = 0.01  # rad/s, about all axes; of the noise and hum of a sensor at rest
 MAX_REST_ACCELERATION_STD = 0.1  # m/s^2, likewise
 
@@ -142,9 +143,17 @@ def _still(rates: Array, block: Array, accelerations: Array, of_block: Array, co
     for at in range(count):
         near, close = (np.abs(places - at) <= REST_BLOCKS for places in (block, of_block))
         if near.sum() >= 2 and close.sum() >= 2:
-            spread = [float(np.linalg.norm(values.std(axis=0))) for values in (rates[near], accelerations[close])]
+            sizes = [int((places == at).sum()) // REST_MEANS for places in (block, of_block)]
+            spread = [_spread_of_means(rates[near], sizes[0]), _spread_of_means(accelerations[close], sizes[1])]
             still[at] = spread[0] < MAX_REST_RATE_STD and spread[1] < MAX_REST_ACCELERATION_STD
     return still
+
+
+def _spread_of_means(values: Array, size: int) -> float:
+    """The standard deviation, of all axes together, of the means of each `size` values (k, 3), or of the values."""
+    size = max(size, 1)
+    means = values[: len(values) // size * size].reshape(-1, size, 3).mean(axis=1)
+    return float(np.linalg.norm(means.std(axis=0)))
 
 
 def _spread(values: Array, block: Array, count: int) -> Array:

@@ -126,6 +126,11 @@ def test_memory_does_not_grow_with_the_log(rates_until):
     assert most < 50 * 40
 
 
+def test_rest_is_found_at_any_rate_of_samples():
+    driven = drive(seconds=8, rate=400, rest=6.0)
+    assert estimated(driven.samples())[1].rest_seconds > 5
+
+
 def test_spikes_of_accelerations_do_not_change_the_measured_gravity():
     driven = drive(seconds=20)
     driven.forces[::97] += [0, 0, 160]
