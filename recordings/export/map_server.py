@@ -38,5 +38,6 @@ def write_yaml(path: Path, picture: str, mosaic: Mosaic) -> None:
         f"origin: [{x:.9f}, {y:.9f}, 0.0]\n"
         "negate: 0\n"
         f"occupied_thresh: {OCCUPIED_THRESH}\n"
-        f"free_thresh: {FREE_THRESH}\n"
+        f"free_thresh: {FREE_THRESH}\n",
+        encoding="utf-8",
     )
