@@ -8,9 +8,12 @@ stages, and the loops of each folder of `recordings`. numba itself compares the 
 
 from __future__ import annotations
 
+import errno
 import functools
 import hashlib
 import logging
+import pickle
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -60,28 +63,43 @@ class _KernelCacheLocator(_CacheLocator):
 
 
 class _KernelCacheFile(IndexDataCacheFile):
-    """numba's files of a kernel. A damaged file counts as missing; a disk that takes no file costs only time."""
+    """numba's files of a kernel. A damaged or foreign file counts as missing; one that cannot be written is reported.
+
+    numba writes an index and then the code, without a checksum: a full disk or two processes at once may leave the code
+    of other sources under an index entry, and a loss of power may leave zeros. So the code is kept with its key, the
+    digest of its sources and a checksum.
+    """
 
     reported = False
 
     def load(self, key: Any) -> Any:
         with suppress(Exception):  # a damaged pickle fails in any way
-            return super().load(key)  # type: ignore[no-untyped-call]
+            *kept, code = super().load(key)  # type: ignore[no-untyped-call]
+            if kept == [key, self._source_stamp, zlib.crc32(code)]:
+                return pickle.loads(code)  # as numba does
         return None
 
     def save(self, key: Any, data: Any) -> None:
+        code = self._dump(data)  # type: ignore[no-untyped-call]
         try:
-            super().save(key, data)  # type: ignore[no-untyped-call]
+            super().save(key, (key, self._source_stamp, zlib.crc32(code), code))  # type: ignore[no-untyped-call]
         except OSError as error:
             if not _KernelCacheFile.reported:
                 _KernelCacheFile.reported = True
-                remedy = "free some space, or set NUMBA_CACHE_DIR to a folder on another disk"
+                full = "free some space, or " if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
+                remedy = f"{full}set NUMBA_CACHE_DIR to a folder that can be written"
                 log.warning("cannot keep compiled kernels in %s: %s; %s", self._cache_path, error.strerror, remedy)
 
     def _load_index(self) -> Any:
         with suppress(Exception):  # likewise
             return super()._load_index()  # type: ignore[no-untyped-call]
         return {}
+
+
+def _cache_file(cache_path: str, filename_base: str, source_stamp: Any) -> IndexDataCacheFile:
+    """The files of a kernel, whose stamp is a digest, or of a function of another program as numba has them."""
+    kind = _KernelCacheFile if isinstance(source_stamp, str) else IndexDataCacheFile
+    return kind(cache_path, filename_base, source_stamp)  # type: ignore[no-untyped-call]
 
 
 class _Announcement(event.Listener):
@@ -102,7 +120,7 @@ class _Announcement(event.Listener):
 def install() -> None:
     """Register the cache locator, the cache file and the announcement with numba."""
     caches: Any = CacheImpl
-    caching.IndexDataCacheFile = _KernelCacheFile  # type: ignore[misc]
+    caching.IndexDataCacheFile = _cache_file  # type: ignore[assignment,misc]
     if _KernelCacheLocator not in caches._locator_classes:
         caches._locator_classes = [_KernelCacheLocator, *caches._locator_classes]
         event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]

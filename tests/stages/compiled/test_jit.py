@@ -1,14 +1,17 @@
 """Compiled kernels are kept between runs, announced when compiled, and compiled again after any source has changed."""
 
 import ast
+import errno
 import os
 import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba.core import caching
 
 from stages.matching.kernels.census import _census
 
@@ -78,27 +81,48 @@ def test_kernels_are_cached_loaded_early_and_recompiled_after_a_change(run, tmp_
     assert "compiling kernels" in stderr
 
 
+def cache_in(folder: Path, stamp: str = "stamp") -> Any:
+    return type(_census._cache._cache_file)(str(folder), "kernel", stamp)
+
+
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
 def test_a_damaged_file_of_the_cache_counts_as_missing(tmp_path, suffix):
-    kept = type(_census._cache._cache_file)(str(tmp_path), "kernel", "stamp")
-    kept.save("key", "code")
-    assert kept.load("key") == "code"
+    kept = cache_in(tmp_path)
+    kept.save("key", "code" * 100)
+    assert kept.load("key") == "code" * 100
     (file,) = tmp_path.glob(f"*.{suffix}")
-    for size in (0, file.stat().st_size - 2):
-        os.truncate(file, size)
+    whole = file.read_bytes()
+    for damaged in (b"", whole[:-2], whole[:-40] + bytes(40), whole[:20] + bytes(8) + whole[28:]):
+        file.write_bytes(damaged)
         assert kept.load("key") is None
         kept.save("key", "code")
         assert kept.load("key") == "code"
 
 
-def test_a_disk_that_takes_no_kernel_is_reported_once(tmp_path, monkeypatch, caplog):
-    kept = type(_census._cache._cache_file)(str(tmp_path / "missing"), "kernel", "stamp")
+@pytest.mark.parametrize(("number", "remedy"), [
+    (errno.ENOSPC, "No space left on device; free some space, or set NUMBA_CACHE_DIR to a folder that can be written"),
+    (errno.EACCES, "Permission denied; set NUMBA_CACHE_DIR to a folder that can be written"),
+])  # fmt: skip
+def test_code_that_cannot_be_kept_is_reported_once_and_never_taken_for_another(
+    tmp_path, monkeypatch, caplog, number, remedy
+):
+    cache_in(tmp_path, "old").save("key", "old code")
+    kept = cache_in(tmp_path, "new")
+
+    def fail(name, data):
+        raise OSError(number, os.strerror(number))
+
     monkeypatch.setattr(type(kept), "reported", False)
+    monkeypatch.setattr(kept, "_save_data", fail)  # after the index
     for _ in range(2):
-        kept.save("key", "code")
-    (said,) = caplog.messages
-    assert said.startswith(f"cannot keep compiled kernels in {tmp_path / 'missing'}: No such file or directory; free ")
-    assert "set NUMBA_CACHE_DIR" in said
+        kept.save("key", "new code")
+        assert kept.load("key") is None
+    assert caplog.messages == [f"cannot keep compiled kernels in {tmp_path}: {remedy}"]
+
+
+def test_functions_of_other_programs_are_kept_as_numba_keeps_them(tmp_path):
+    kept = caching.IndexDataCacheFile(cache_path=str(tmp_path), filename_base="other", source_stamp=(1.5, 20))
+    assert type(kept) is not type(_census._cache._cache_file)
 
 
 @pytest.mark.slow
