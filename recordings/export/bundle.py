@@ -88,12 +88,13 @@ def export(
     else:
         topics = _topics_of(result, maps)
         frames = frames or _is_in_level(result, topics, lost)
-    poses = [] if maps else _export_poses(result, out, lost)
     if frames and places:
         raise LogError(ONLY_REGIONAL)
     if frames:
-        return _export_frames(result, out, lost, topics, points=not maps) + poses
-    return _export_region(result, out, lost, topics, places) + poses
+        files = _export_frames(result, out, lost, topics, points=not maps)
+    else:
+        files = _export_region(result, out, lost, topics, places)
+    return files if maps else files + _export_poses(result, out, lost)
 
 
 def _topics_of(result: Path, maps: Collection[str]) -> MapTopics:

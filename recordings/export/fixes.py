@@ -73,8 +73,10 @@ def _fix(message: Any) -> _Fix:
     latitude, longitude, fault = float(message.latitude), float(message.longitude), ""
     if message.status.status < 0:
         fault = f"status {message.status.status}, no fix"
-    elif not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
-        fault = "no place on the Earth"
+    elif latitude == longitude == 0:
+        fault = "latitude and longitude 0, as of a receiver without a fix"
+    elif not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        fault = "no latitude and longitude in range"
     elif abs(latitude) > MAX_LATITUDE:
         fault = f"latitudes beyond {MAX_LATITUDE} deg, which UTM does not cover"
     return _Fix(stamp_of(message.header), latitude, longitude, fault)

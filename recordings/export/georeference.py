@@ -24,6 +24,7 @@ from flow.contracts import counted
 from recordings.errors import LogError
 from recordings.export.fixes import read_fixes
 from recordings.mcap.file import iter_decoded
+from recordings.ros2.from_msg import stamp_of
 from stages.data import LEVEL_FRAME, Array
 
 SEMI_MAJOR, FLATTENING = 6_378_137.0, 1 / 298.257223563  # of WGS 84
@@ -129,28 +130,28 @@ def georeferences(
         except LogError as error:
             faults[name] = error
     if not places:
-        raise LogError(f"{'; '.join(map(str, faults.values()))}; export without --crs, or a longer drive")
+        raise LogError(f"{'; '.join(map(str, faults.values()))}; export without --crs")
     lost.update(f"the map in '{name}' is not georeferenced: {fault}" for name, fault in faults.items())
     return places
 
 
 def _poses(result: Path, maps: Collection[str], lost: Counter[str]) -> dict[str, Array]:
-    """Frame of reference of a map -> its poses, (n, 3): stamp, ns, x and y."""
+    """Frame of reference of a map -> its poses, (n, 3): stamp, ns, x and y. Of all frames if there is no map."""
     rows, mapped = dict[str, list[tuple[float, ...]]](), set[str]()
-    for topic, stamp, message in iter_decoded(result, ["/nav/pose", *maps], lost):
+    for topic, _, message in iter_decoded(result, ["/nav/pose", *maps], lost):
         if topic in maps:
             mapped.add(message.header.frame_id)
             continue
         place = message.pose.pose.position
-        rows.setdefault(message.header.frame_id, []).append((stamp, place.x, place.y))
+        rows.setdefault(message.header.frame_id, []).append((stamp_of(message.header), place.x, place.y))
     if not rows:
         raise LogError(f"{result} has no poses; run the log with a pose stream")
     if mapped == {LEVEL_FRAME}:
         raise LogError(ONLY_REGIONAL)
-    if not mapped & rows.keys():
-        named = " or ".join(f"'{name}'" for name in sorted(mapped)) or "a frame of a regional map"
+    if mapped and not mapped & rows.keys():
+        named = " or ".join(f"'{name}'" for name in sorted(mapped))
         raise LogError(f"{result} has no poses in {named}; export without --crs")
-    return {name: np.array(own) for name, own in rows.items() if name in mapped}
+    return {name: np.array(sorted(own)) for name, own in rows.items() if name in (mapped or rows)}
 
 
 def _zone(crs: str, poses: Mapping[str, Array], fixes: Mapping[str, Array]) -> int:
@@ -192,8 +193,8 @@ def _fitted(name: str, poses: Array, topic: str, fixes: Array, epsg: int) -> Geo
     """
     driven, places = _pairs(poses, fixes)
     if len(driven) < MIN_FIXES:
-        few = counted(len(driven), "fix", "fixes")
-        raise LogError(f"within {MAX_APART_S:g} s of poses in '{name}', {topic} has only {few}; {MIN_FIXES} are needed")
+        of = f"{counted(len(fixes), 'fix', 'fixes')} of {topic} and {counted(len(poses), 'pose')} in '{name}'"
+        raise LogError(f"only {len(driven)} of {of} are within {MAX_APART_S:g} s of each other; {MIN_FIXES} are needed")
     x, grid = driven - driven.mean(), places - places.mean()
     distance = (places.mean().real - FALSE_EASTING) / (SCALE * SEMI_MAJOR)
     scale = SCALE * (1 + distance**2 / 2)
@@ -203,7 +204,9 @@ def _fitted(name: str, poses: Array, topic: str, fixes: Array, epsg: int) -> Geo
     stretch = abs(np.vdot(x, grid)) / (scale * spread**2 * len(x)) if spread else math.inf
     is_mirrored = residual > max(MIRROR_SHARE * spread, MIRROR_RATIO * mirrored)
     if not (sigma <= MAX_HEADING_SIGMA and abs(stretch - 1) <= MAX_STRETCH) or is_mirrored:
-        instead = f"; mirrored, they are {mirrored:.2f} m off: is y to the left?" if is_mirrored else ""
+        instead = "" if abs(stretch - 1) > MAX_STRETCH else "; a longer drive may"
+        if is_mirrored:
+            instead = f"; mirrored, they are {mirrored:.2f} m off: is y to the left?"
         raise LogError(
             f"the fixes of {topic} do not determine the heading of '{name}': they span {_extent(grid):.1f} m, and are "
             f"{residual:.2f} m off a drive over {_extent(x):.1f} m{instead}"

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from flow.contracts import as_text
 from recordings.atomic_write import written
 from recordings.containers.finding import find_files
 from recordings.errors import LogError
@@ -167,24 +168,17 @@ def merge(results: Sequence[Path], out: Path, lost: Counter[str] | None = None) 
 
 def _check_inputs(results: Sequence[Path]) -> None:
     """Raise LogError for two results with a common part of the same input, which would count as independent."""
-    abouts = [about_run(result) for result in results]
+    abouts, files = [about_run(result) for result in results], [_files_of(result) for result in results]
     for first, second in combinations(range(len(results)), 2):
         inputs = [abouts[number].get("log_digest") or results[number].resolve() for number in (first, second)]
         (begin, end), (other_begin, other_end) = _seconds(abouts[first]), _seconds(abouts[second])
         same = inputs[0] == inputs[1] and begin < other_end and other_begin < end
-        if same or _have_common_file(results[first], results[second]):
+        several = max(len(files[first]), len(files[second])) > 1 and files[first] & files[second]
+        if same or (several and np.isin(stamps_of(results[first]), stamps_of(results[second])).any()):
             raise LogError(
                 f"{results[first]} and {results[second]} are results of the same input, which would count twice; "
                 "give one of them"
             )
-
-
-def _have_common_file(one: Path, other: Path) -> bool:
-    """Whether inputs of different files, at least one of several, have a file in common: its name and a stamp in it."""
-    names, others = _files_of(one), _files_of(other)
-    if max(len(names), len(others)) < 2 or not names & others:
-        return False
-    return bool(np.isin(stamps_of(one), stamps_of(other)).any())
 
 
 def _files_of(result: Path) -> set[str]:
@@ -193,7 +187,7 @@ def _files_of(result: Path) -> set[str]:
     if not beside[0].is_dir():
         return set(about_run(result).get("log", "").split(", "))
     with suppress(LogError):
-        return {file.name for file in find_files(beside).files}
+        return {as_text(file.name) for file in find_files(beside).files}
     return set()
 
 

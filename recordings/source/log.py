@@ -154,7 +154,7 @@ class McapLog(AbstractContextManager["McapLog"]):
         readers = by_channel(self._readers.of_samples())
         source, offset = self.source, self.time_offset("inclinometer")
         wide = part.widened(LOOKAHEAD_NS + min(abs(offset), MAX_LATENESS_NS))
-        if whole and not self._have_jumped(set(readers), wide.low):
+        if whole and not self._have_jumped(self.channels("inclinometer"), wide.low):
             wide = replace(wide, low=None)
         self._estimator = UpEstimator(self.resolution.tilt_frame, source.accelerometer_bias, source.gravity)
         for log_time, item in estimated_tilts(tilt, self._samples(readers, wide), self._estimator):

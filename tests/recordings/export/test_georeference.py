@@ -143,6 +143,7 @@ def test_the_fixes_of_all_files_of_an_input_count(result, tmp_path, said):
 @pytest.mark.parametrize(("name", "why"), [
     ("elevation_map", "--crs georeferences regional maps only, not those of every frame; leave out --crs"),
     ("regional_navigation_map", "--crs georeferences elevation maps, and none in 'odom' is exported; leave out --crs"),
+    ("regional_maap", "did you mean 'regional_map'?"),
 ])  # fmt: skip
 def test_a_map_that_has_no_georeference_is_refused(result, tmp_path, refused, capsys, name, why):
     stamps, places = driven(result)
@@ -167,7 +168,7 @@ def test_fixes_that_say_too_little_are_refused(result, traverse, tmp_path, refus
     few = write_fixes(tmp_path / "few.mcap", stamps[:2], on_grid(places[:2]))
     for log, sentence in (
         (noisy, "do not determine the heading of 'odom'"),
-        (few, "only 2 fixes"),
+        (few, "only 2 of 2 fixes"),
         (traverse, "no fixes"),
     ):
         assert sentence in refused("export", result, tmp_path / "maps", "--crs", "utm", "--fixes", log)
@@ -231,8 +232,10 @@ def test_halts_between_poses_that_are_far_apart_shift_nothing(tmp_path):
 @pytest.mark.parametrize(("rows", "cause"), [
     (degrees(STAMPS, 400 * [89.0], 400 * [20.0]), "400 of /gps/fix have latitudes beyond 84 deg"),
     (degrees(STAMPS, 400 * [48.0], 400 * [20.0], status=-1), "400 of /gps/fix have status -1, no fix"),
-    (degrees(STAMPS, 400 * [0.0], 400 * [0.0]), "400 of /gps/fix have no place on the Earth"),
-    (degrees(STAMPS + 10**12, 400 * [48.0], 400 * [20.0]), "/gps/fix has only 0 fixes"),
+    (degrees(STAMPS, 400 * [0.0], 400 * [0.0]), "400 of /gps/fix have latitude and longitude 0, as of a receiver with"),
+    (degrees(STAMPS, 400 * [0.0], 400 * [200.0]), "400 of /gps/fix have no latitude and longitude in range"),
+    (degrees(STAMPS + 10**12, 400 * [48.0], 400 * [20.0]),
+     "only 0 of 400 fixes of /gps/fix and 400 poses in 'odom' are within 0.5 s of each other; 3 are needed; export"),
 ])  # fmt: skip
 def test_the_cause_is_named_where_no_fix_is_usable(rows, cause, drive, tmp_path, refused):
     log = write_messages(tmp_path / "fixes.mcap", rows)
@@ -246,6 +249,13 @@ def test_a_zone_is_that_of_the_fixes_beside_the_poses(drive, tmp_path):
     write_messages(log, [*early, *null, *fixes_at(STAMPS, on_grid(CURVE, scale_at(ORIGIN[0])))])
     found, _ = place_of(drive, log)
     assert (found.epsg, found.fixes) == (32633, 400)
+    np.testing.assert_allclose(found.at(0, 0), ORIGIN, atol=0.01)
+
+
+def test_poses_count_at_their_own_stamps(drive, tmp_path):
+    """Not at the log times of a result that was recorded again while it was played."""
+    again = rewrite(drive, tmp_path / "again.mcap", time=lambda topic, log_time: log_time + 2_000_000_000)
+    found, _ = place_of(again, write_fixes(tmp_path / "fixes.mcap", STAMPS, on_grid(CURVE, scale_at(ORIGIN[0]))))
     np.testing.assert_allclose(found.at(0, 0), ORIGIN, atol=0.01)
 
 
@@ -280,5 +290,5 @@ def test_a_frame_without_fixes_leaves_the_others_their_place(tmp_path, said):
     log = write_fixes(tmp_path / "fixes.mcap", STAMPS[:180], on_grid(CURVE[:180], scale_at(ORIGIN[0])))
     printed = said(3, "export", both, tmp_path / "maps", "--crs", "utm", "--fixes", log).out
     assert "frame 'odom' is placed in EPSG:32633 by 180 fixes" in printed
-    assert "both.mcap: the map in 'map' is not georeferenced: within" in printed
+    assert "both.mcap: the map in 'map' is not georeferenced: only 0 of 180 fixes" in printed
     assert "unmapped" not in printed

@@ -1,6 +1,7 @@
 """Regional maps of several logs as one: the mean, its logs, and logs that do not fit."""
 
 import json
+import os
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from stages.data import Cell, ElevationMap, NavigationMap
 from tests.conftest import chunks_of, edit_of, rewrite, roverflow, with_broken, write_messages
 
 STEP, SHAPE = 0.1, (50, 60)
+SOUTH = "s\\udcfcd_{}.mcap"  # the name of a file as results contain it, which is not Unicode
 
 
 def traverse(
@@ -115,15 +117,16 @@ def test_results_with_a_common_part_of_an_input_are_refused(tmp_path, part, refu
 
 
 @pytest.mark.parametrize(("log", "stamp", "refused"), [
-    ("drive_0.mcap, drive_1.mcap", 5, True), ("drive", 5, True), ("drive_0.mcap, drive_1.mcap", 6, False),
-    ("drive_1.mcap, drive_2.mcap", 5, False), ("drive_0.mcap", 5, False),
+    (f"{SOUTH}, {SOUTH}".format(0, 1), 5, True), ("drive", 5, True), (f"{SOUTH}, {SOUTH}".format(0, 1), 6, False),
+    (f"{SOUTH}, {SOUTH}".format(1, 2), 5, False), (SOUTH.format(0), 5, False),
 ])  # fmt: skip
 def test_results_with_a_common_file_of_their_inputs_are_refused(tmp_path, log, stamp, refused):
     folder = tmp_path / "drive"
     folder.mkdir()
     for number in range(2):
-        write_messages(folder / f"drive_{number}.mcap", [(5, "/nav/diagnostics", ros2.diagnostics(5, []))])
-    first = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, -1, log="drive_0.mcap", log_digest="a")
+        file = folder / os.fsdecode(b"s\xfcd_%d.mcap" % number)
+        write_messages(file, [(5, "/nav/diagnostics", ros2.diagnostics(5, []))])
+    first = traverse(tmp_path / "a.mcap", 0, 1.0, 4e-4, -1, log=SOUTH.format(0), log_digest="a")
     other = traverse(tmp_path / "b.mcap", 0, 1.0, 4e-4, -1, stamp=stamp, log=log, log_digest="b")
     with pytest.raises(LogError, match="results of the same input") if refused else nullcontext():
         merge([first, other], tmp_path / "out")

@@ -122,6 +122,25 @@ def test_rates_with_stamps_of_another_clock_are_refused_with_the_setting(tmp_pat
     assert "corrects the rates" not in note
 
 
+def test_a_part_is_estimated_from_the_beginning_whatever_the_clock_of_the_rates(tmp_path):
+    driven, behind = drive(seconds=26), 1000 * 10**9
+
+    def apart(number, stamp, rate, force):
+        rates = split(number, stamp - behind, rate, force)["/camera/gyro/sample"]
+        return split(number, stamp, rate, force) | {"/camera/gyro/sample": rates}
+
+    path = written(tmp_path / "together.mcap", driven, apart, GYRO)
+    log = rewrite(path, tmp_path / "log.mcap", time=lambda topic, time: time + 3_000_000 * ("accel" in topic))
+    source = McapSource(time_offset=TimeOffsets(gyroscope=behind))
+    whole = {tilt.stamp: tilt for tilt in read(log, source)[0]}
+    for start in np.arange(24, 24.014, 0.002):
+        with source.open(log) as opened:
+            opened.narrow(start, start + 0.1)
+            part = [item for _, stream, item in opened.events() if stream == "inclinometer"]
+        assert part
+        assert all(np.array_equal(tilt.up, whole[tilt.stamp].up) for tilt in part)
+
+
 def test_the_accelerations_of_the_setting_are_not_those_of_a_gyroscope(tmp_path):
     driven = drive(seconds=4)
     path = written(tmp_path / "log.mcap", driven, split, GYRO)
