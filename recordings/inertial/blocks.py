@@ -47,7 +47,8 @@ class Blocks:
     that the sensor turned through; force: (n, 3) m/s^2, mean acceleration in the gyroscope's frame, NaN where there is
     none; axes: (n, 3, 3), mean of the rotations of these accelerations; still: (n,) whether the sensor hardly moves;
     rate: (n, 3) rad/s, mean; shaking: (n,) m/s^2, standard deviation of the accelerations; samples: (n,) of the rate;
-    stamps: (m,) ns; rotations: (m, 3, 3); block: (m,) index.
+    bias: (n, 3) rad/s, of the gyroscope, that the rotations leave out; stamps: (m,) ns; rotations: (m, 3, 3); block:
+    (m,) index.
     """
 
     seconds: Array
@@ -59,6 +60,7 @@ class Blocks:
     rate: Array
     shaking: Array
     samples: Array
+    bias: Array
     stamps: Array
     rotations: Array
     block: Array
@@ -87,8 +89,9 @@ class Blocks:
 def integrate(samples: Sequence[InertialSample], begin: Knot, bias: Array, origin: int) -> tuple[Blocks, Knot]:
     """The blocks of samples after `begin`, in the order of stamps, and the last knot; at least one has a rate.
 
-    bias: (3,) rad/s of the gyroscope; origin: ns, the time at which a block begins. A step between two samples turns
-    by the mean of their rates.
+    bias: (3,) rad/s of the gyroscope; origin: ns, the time at which a block begins. The rate of some sensors is a
+    sample, of others the mean since the sample before. So each counts for a quarter of an
+    interval before its stamp.
     """
     from scipy.spatial.transform import Rotation  # takes long to import
 
@@ -96,7 +99,7 @@ def integrate(samples: Sequence[InertialSample], begin: Knot, bias: Array, origi
     stamps = np.array([begin.stamp, *(sample.stamp for sample in rated)])
     rates = np.array([begin.rate, *(sample.rate for sample in rated)])
     steps = np.diff(stamps) / 1e9
-    mean_rates = (rates[1:] + rates[:-1]) / 2
+    mean_rates = (3 * rates[1:] + rates[:-1]) / 4
     turns = Rotation.from_rotvec((mean_rates - bias) * steps[:, None]).as_matrix()
     rotations = np.empty((len(stamps), 3, 3))
     rotations[0] = begin.rotation
@@ -113,7 +116,7 @@ def integrate(samples: Sequence[InertialSample], begin: Knot, bias: Array, origi
         angle=np.bincount(block, np.linalg.norm(mean_rates - bias, axis=1) * steps, count),
         force=force, axes=axes, still=_still(rates[1:], block, accelerations, of_block, count),
         rate=_sums(rates[1:], block, count) / samples_of[:, None], shaking=scatter, samples=samples_of,
-        stamps=stamps[1:], rotations=rotations[1:], block=block,
+        bias=np.tile(bias, (count, 1)), stamps=stamps[1:], rotations=rotations[1:], block=block,
     )  # fmt: skip
     return blocks, Knot(int(stamps[-1]), rates[-1], nearest_rotation(rotations[-1]))
 

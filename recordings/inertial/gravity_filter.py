@@ -31,6 +31,7 @@ GYROSCOPE_SCALE = 0.005  # share of an angle
 GYROSCOPE_BIAS_SIGMA = 0.1
 GYROSCOPE_RESTART_SIGMA = 0.02  # of the change of a bias if the sensor was off
 GYROSCOPE_BIAS_WALK = 2e-5
+GYROSCOPE_BIAS_STEP = GYROSCOPE_RESTART_SIGMA / np.sqrt(10)  # walk of a bias that changes within ten seconds
 ACCELEROMETER_BIAS_WALK = 1e-4
 REST_RATE_SIGMA = 5e-4  # of a mean rate at rest: instability of the bias, and the planet's own rotation
 MIN_TURN = 0.01  # of a rover; a smaller mean rate at rest is a bias about all axes
@@ -43,6 +44,8 @@ USUAL_BLOCKS = 100  # measured blocks that count as much as the usual disturbanc
 DISTURBANCE_BLOCKS = 100  # over which the disturbance is measured
 DISTURBANCE_SPANS = (1, 2, 4, 8, 16)  # blocks
 MAX_SURPRISE = 3.0  # sigmas; a block that is farther off counts less
+LASTING_BLOCKS = 50  # whose median surprise shows a change of the gyroscope's bias
+LASTING_SURPRISE = 2.5  # sigmas of that median
 
 S, B, A, T = slice(0, 3), slice(3, 6), slice(6, 9), 9
 SIZE = 10
@@ -58,13 +61,14 @@ class GravityState:
 
 @dataclass(frozen=True)
 class FilterStep:
-    """One block: the transition (10, 10) to it, the state predicted, the state with its measurements, and whether the
-    sensor is at rest."""
+    """One block: the transition (10, 10) to it, the state predicted, the state with its measurements, whether the
+    sensor is at rest, and how far the acceleration is off the predicted one: (3,) sigmas, NaN where there is none."""
 
     transition: Array
     predicted: GravityState
     updated: GravityState
     rest: bool
+    off: Array
 
 
 def first_state(force: Array, accelerometer_bias: float, gravity: float | None) -> GravityState:
@@ -120,21 +124,26 @@ def is_rest(blocks: Blocks, at: int, state: GravityState) -> bool:
     return bool(blocks.still[at]) and _surprise(blocks.rate[at] - state.mean[B], spread) < MAX_SURPRISE**2
 
 
-def advance(state: GravityState, blocks: Blocks, at: int, bias: Array, density: float, resting: bool) -> FilterStep:
-    """The step over block `at`, integrated with the gyroscope's bias `bias`.
+def advance(
+    state: GravityState, blocks: Blocks, at: int, density: float, resting: bool, walk: float = GYROSCOPE_BIAS_WALK
+) -> FilterStep:
+    """The step over block `at`.
 
-    density: the disturbance in motion, (m/s^2)^2/Hz; resting: whether the block before is at rest.
+    density: the disturbance in motion, (m/s^2)^2/Hz; resting: whether the block before is at rest; walk: of the
+    gyroscope's bias, rad/s for 1 s.
     """
     up = blocks.axes[at].T @ state.mean[S] / np.linalg.norm(state.mean[S])
     rate = float(up @ blocks.rate[at]) if np.isfinite(up).all() else 0.0
-    predicted, transition = _predicted(state, blocks, at, bias, None if resting else rate)
-    rest, updated = is_rest(blocks, at, predicted), predicted
+    predicted, transition = _predicted(state, blocks, at, None if resting else rate, walk)
+    rest, updated, off = is_rest(blocks, at, predicted), predicted, np.full(3, np.nan)
     if np.isfinite(blocks.force[at]).all():
         model = np.hstack([np.eye(3), np.zeros((3, 3)), blocks.axes[at], np.zeros((3, 1))])
         if rest:
             variance = REST_SIGMA**2 + blocks.shaking[at] ** 2 / 3 / blocks.samples[at]
         else:
             variance = density / max(blocks.seconds[at], 1e-3)
+        spread = float(np.trace(model @ predicted.covariance @ model.T)) / 3 + variance
+        off = (blocks.force[at] - model @ predicted.mean) / np.sqrt(spread)
         updated = _updated(updated, model, blocks.force[at], variance)
         if rest and np.linalg.norm(blocks.rate[at]) < MIN_TURN:
             model = np.hstack([np.zeros((3, 3)), np.eye(3), np.zeros((3, 4))])
@@ -142,15 +151,28 @@ def advance(state: GravityState, blocks: Blocks, at: int, bias: Array, density: 
         elif rest:
             model = np.concatenate([np.zeros(3), up, np.zeros(3), [1.0]])[None]
             updated = _updated(updated, model, np.array([rate]), _rate_variance(blocks, at))
-    return FilterStep(transition, predicted, updated, rest)
+    return FilterStep(transition, predicted, updated, rest, off)
 
 
-def filtered(first: FilterStep, blocks: Blocks, bias: Array, density: float) -> list[FilterStep]:
-    """The steps over blocks after `first`; bias, density: as of `advance`."""
+def filtered(first: FilterStep, blocks: Blocks, density: float, walk: float = GYROSCOPE_BIAS_WALK) -> list[FilterStep]:
+    """The steps over blocks after `first`; density, walk: as of `advance`."""
     steps = [first]
     for at in range(len(blocks)):
-        steps.append(advance(steps[-1].updated, blocks, at, bias, density, steps[-1].rest))
+        steps.append(advance(steps[-1].updated, blocks, at, density, steps[-1].rest, walk))
     return steps[1:]
+
+
+def surprise_lasts(steps: list[FilterStep]) -> bool:
+    """Whether most of the last accelerations are off in one direction, as those of a gyroscope with another bias are.
+
+    A bump or a rover that speeds up disturbs few blocks. Rough ground disturbs all of them, in changing directions.
+    """
+    off = np.array([step.off for step in steps[-LASTING_BLOCKS:]])
+    off = off[np.isfinite(off).all(axis=1)]
+    if len(off) < LASTING_BLOCKS:
+        return False
+    of_median = np.pi / 2 / LASTING_BLOCKS  # variance of the median of normal values
+    return float((np.median(off, axis=0) ** 2).mean()) > LASTING_SURPRISE**2 * of_median
 
 
 def smoothed(steps: list[FilterStep]) -> list[GravityState]:
@@ -175,11 +197,11 @@ def sigma_of(state: GravityState) -> float:
 
 
 def _predicted(
-    state: GravityState, blocks: Blocks, at: int, bias: Array, turn: float | None
+    state: GravityState, blocks: Blocks, at: int, turn: float | None, walk: float
 ) -> tuple[GravityState, Array]:
     """The state and the transition to it; turn: rad/s, about gravity, of a rest that may begin, None within one."""
     force, seconds = state.mean[S], blocks.seconds[at]
-    drift = blocks.turned[at] @ (state.mean[B] - bias)
+    drift = blocks.turned[at] @ (state.mean[B] - blocks.bias[at])
     transition = np.eye(SIZE)
     transition[S, S] += cross_matrix(drift)
     transition[S, B] = -cross_matrix(force) @ blocks.turned[at]
@@ -191,7 +213,7 @@ def _predicted(
         noise[T, T] = turn**2
     across = float(force @ force) * np.eye(3) - np.outer(force, force)
     noise[S, S] = (GYROSCOPE_NOISE**2 * seconds + (GYROSCOPE_SCALE * blocks.angle[at]) ** 2) * across
-    noise[B, B] = GYROSCOPE_BIAS_WALK**2 * seconds * np.eye(3)
+    noise[B, B] = walk**2 * seconds * np.eye(3)
     noise[A, A] = ACCELEROMETER_BIAS_WALK**2 * seconds * np.eye(3)
     noise += 1e-12 * np.eye(SIZE)
     return GravityState(mean, transition @ state.covariance @ transition.T + noise), transition

@@ -13,6 +13,7 @@ import numpy as np
 from recordings.inertial.blocks import BLOCK_NS, Blocks, InertialSample, Knot, integrate
 from recordings.inertial.gravity_filter import (
     DISTURBANCE_BLOCKS,
+    GYROSCOPE_BIAS_STEP,
     SIZE,
     FilterStep,
     GravityState,
@@ -22,6 +23,7 @@ from recordings.inertial.gravity_filter import (
     restarted,
     sigma_of,
     smoothed,
+    surprise_lasts,
 )
 from stages.data import Array, Tilt
 
@@ -129,13 +131,12 @@ class UpEstimator:
                 started = self._started(blocks, first)
                 if started is None:
                     return
-                begin = FilterStep(np.eye(SIZE), started, started, rest=False)
-                steps = filtered(begin, blocks, bias, disturbance(self._in_motion(blocks)))
+                begin = FilterStep(np.eye(SIZE), started, started, rest=False, off=np.full(3, np.nan))
+                steps = filtered(begin, blocks, disturbance(self._in_motion(blocks)))
                 bias = steps[-1].updated.mean[3:6]
             self._knot, self._steps = before, [begin]
         blocks, self._knot = integrate(samples, self._knot, bias, self._origin)
-        self._filter(blocks, bias)
-        self._blocks = blocks if self._blocks is None else self._blocks.then(blocks)
+        self._filter(blocks)
 
     @staticmethod
     def _knot_before(samples: list[InertialSample]) -> Knot:
@@ -153,13 +154,18 @@ class UpEstimator:
             return restarted(before, force, (self._origin - self._ended) / 1e9, self.gravity)
         return first_state(force, self.accelerometer_bias, self.gravity)
 
-    def _filter(self, blocks: Blocks, bias: Array) -> None:
+    def _filter(self, blocks: Blocks) -> None:
+        """Add blocks and the steps over them. If accelerations stay off, the gyroscope's bias may have changed in any
+        block without a tilt."""
         self._forces = self._in_motion(blocks)
-        steps = filtered(self._steps[-1], blocks, bias, disturbance(self._forces))
-        self._state = steps[-1].updated
-        self._steps += steps
+        density, rested = disturbance(self._forces), self._rested()
+        self._steps += filtered(self._steps[-1], blocks, density)
+        self._blocks = blocks if self._blocks is None else self._blocks.then(blocks)
+        if surprise_lasts(self._steps):
+            self._steps[1:] = filtered(self._steps[0], self._blocks, density, GYROSCOPE_BIAS_STEP)
+        self._state = self._steps[-1].updated
         self.seconds += float(blocks.seconds.sum())
-        self.rest_seconds += float(blocks.seconds[[step.rest for step in steps]].sum())
+        self.rest_seconds += self._rested() - rested
         self._compare(blocks)
         force = blocks.force[np.isfinite(blocks.force).all(axis=1)]
         middle = np.median(force, axis=0) if len(force) else np.zeros(3)
@@ -167,6 +173,12 @@ class UpEstimator:
         if len(force):
             weight = float(blocks.seconds.sum()) / self.seconds
             self.measured_gravity += weight * (float(np.linalg.norm(force.mean(axis=0))) - self.measured_gravity)
+
+    def _rested(self) -> float:
+        """Time at rest, s, in the blocks without tilts."""
+        if self._blocks is None:
+            return 0.0
+        return float(self._blocks.seconds[[step.rest for step in self._steps[1:]]].sum())
 
     def _in_motion(self, blocks: Blocks) -> Array:
         """The mean accelerations of the last blocks in motion up to these."""
@@ -195,14 +207,35 @@ class UpEstimator:
         self._first = False
         states, blocks = smoothed(self._steps), self._blocks[:count]
         self._steps, self._blocks = self._steps[count:], self._blocks[count:]
-        ends = blocks.stamps[np.searchsorted(blocks.block, np.arange(count), side="right") - 1]
-        sigmas, made = [sigma_of(state) for state in states[1 : count + 1]], []
-        for stamp, rotation, at in zip(blocks.stamps.tolist(), blocks.rotations, blocks.block.tolist(), strict=True):
-            if stamp - self._last < MIN_TILT_INTERVAL_NS:
-                continue
-            length = blocks.seconds[at] * 1e9
-            share = 1 - (ends[at] - stamp) / length if length > 0 else 1.0
-            up = rotation.T @ ((1 - share) * states[at].mean[:3] + share * states[at + 1].mean[:3])
-            made.append(Tilt(stamp, up / np.linalg.norm(up), self.frame_id, sigmas[at], filtered=True))
-            self._last = stamp
+        ups = _ups(blocks, np.array([state.mean[:3] for state in states[: count + 1]]))
+        of_blocks = np.array([sigma_of(state) for state in states[1 : count + 1]])
+        sigmas = np.hypot(of_blocks[blocks.block], _step_sigmas(ups))
+        made = list[Tilt]()
+        for stamp, up, sigma in zip(blocks.stamps.tolist(), ups, sigmas.tolist(), strict=True):
+            if stamp - self._last >= MIN_TILT_INTERVAL_NS:
+                made.append(Tilt(stamp, up, self.frame_id, sigma, filtered=True))
+                self._last = stamp
         return made
+
+
+def _ups(blocks: Blocks, gravity: Array) -> Array:
+    """Up in the sensor's frame at each sample, (m, 3); gravity: (n + 1, 3) at the ends of the blocks."""
+    at = blocks.block
+    ends = blocks.stamps[np.searchsorted(at, np.arange(len(blocks)), side="right") - 1]
+    left = (ends[at] - blocks.stamps) / np.maximum(blocks.seconds[at] * 1e9, 1.0)
+    force = left[:, None] * gravity[at] + (1 - left[:, None]) * gravity[at + 1]
+    up = (np.swapaxes(blocks.rotations, 1, 2) @ force[:, :, None])[:, :, 0]
+    return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
+
+
+def _step_sigmas(ups: Array) -> Array:
+    """What the steps between samples err by, rad, about each horizontal axis: (m,). ups: (m, 3).
+
+    A rate may be a sample or the mean since the sample before: `integrate` is a quarter of a step's turn off either.
+    What happens between samples shows in the change of the turn from step to step.
+    """
+    if len(ups) < 3:
+        return np.zeros(len(ups))
+    turns = np.diff(ups, axis=0)
+    sizes = np.hypot(np.linalg.norm(turns[:-1], axis=1) / 4, np.linalg.norm(np.diff(turns, axis=0), axis=1) / 2)
+    return np.pad(sizes / np.sqrt(2), 1, mode="edge")

@@ -12,11 +12,16 @@ from recordings.inertial.gravity_filter import GYROSCOPE_BIAS_WALK, disturbance
 from recordings.inertial.up_estimator import UpEstimator
 from stages.data import Tilt
 from tests.conftest import data_folder, slow
-from tests.recordings.inertial.drive import drive, estimated
+from tests.recordings.inertial.drive import Drive, drive, estimated
 
 
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+def judged(driven, tilts):
+    """The RMS of the errors about each horizontal axis over their stated sigmas."""
+    return rms(driven.errors(tilts) / np.sqrt(2) / np.degrees([tilt.sigma for tilt in tilts]))
 
 
 @pytest.mark.parametrize(("changes", "largest", "first"), [
@@ -32,7 +37,7 @@ def rms(values):
     ),
 ])  # fmt: skip
 def test_up_is_right_at_rest_and_while_driving(changes, largest, first):
-    errors, judged = [], []
+    errors, of_sigma = [], []
     for seed in (1, 2, 3):
         driven = drive(seed=seed, **changes)
         tilts, estimator = estimated(driven.samples())
@@ -41,11 +46,20 @@ def test_up_is_right_at_rest_and_while_driving(changes, largest, first):
         assert tilts[-1].stamp > driven.stamps[-1] - 10_000_000
         assert estimator.measured_gravity == pytest.approx(changes.get("gravity", 9.81), rel=0.02)
         errors.append((rms(found), rms(found[: len(found) // 6])))
-        judged.append(rms(found / np.sqrt(2) / np.degrees([tilt.sigma for tilt in tilts])))
+        of_sigma.append(judged(driven, tilts))
     whole, begin = np.mean(errors, axis=0)
     assert whole < largest
     assert begin < first
-    assert 0.2 < rms(judged) < 1.2  # of the stated sigma
+    assert 0.2 < rms(of_sigma) < 1.2
+
+
+@pytest.mark.parametrize(("rate", "taken"), [(5, 1), (10, 1), (100, 20), (100, 10)])
+def test_the_sigma_of_slow_samples_contains_the_motion_between_them(rate, taken):
+    """Rates are means over the interval before them, or a sample of it."""
+    whole = drive(rate=rate, vibration=0.1)
+    driven = Drive(*(values[::taken] for values in (whole.stamps, whole.rates, whole.forces, whole.up)))
+    tilts, _ = estimated(driven.samples())
+    assert 0.2 < judged(driven, tilts) < 1.2
 
 
 @pytest.mark.parametrize(("spin", "slope"), [(0.2, 0), *slow((0.05, 10), (0.1, 10), (0.2, 10))])
@@ -94,6 +108,23 @@ def test_a_gyroscope_may_restart_with_another_bias_in_a_gap(rest):
     assert estimator.rest_seconds > rest - 7
 
 
+@pytest.mark.parametrize("step", [0.3, 1.0])
+def test_a_gyroscope_may_change_its_bias_while_it_drives(step):
+    driven = drive(seconds=70)
+    driven.rates[4000:] += np.radians([step, -step, step])
+    tilts, _ = estimated(driven.samples())
+    assert rms(driven.errors(tilts)) < 0.6
+    assert judged(driven, tilts) < 1.2
+
+
+def test_bumps_and_a_short_push_are_no_change_of_the_bias():
+    driven = drive(vibration=2.0)
+    driven.forces[2000:5500:100] += [5, 0, 40]
+    driven.forces[3050:3250] += [1, 0, 0]
+    _, estimator = estimated(driven.samples())
+    assert np.sqrt(estimator._state.covariance[3, 3]) < 0.001
+
+
 def test_a_long_gap_leaves_doubt_about_the_gyroscope_and_none_about_a_known_gravity():
     """After an hour the gyroscope's bias has drifted by two standard deviations, and the rover is tilted otherwise."""
     driven, estimator = drive(seconds=120), UpEstimator("imu", 0.03, gravity=9.81)
@@ -110,7 +141,7 @@ def test_a_long_gap_leaves_doubt_about_the_gyroscope_and_none_about_a_known_grav
     assert estimator._state.covariance[8, 8] < 1.3 * sure
     late = [tilt for tilt in tilts if tilt.stamp > hour + before[-1].stamp]
     found = [replace(tilt, stamp=tilt.stamp - hour, up=turn.inv().as_matrix() @ tilt.up) for tilt in late]
-    assert rms(driven.errors(found) / np.sqrt(2) / np.degrees([tilt.sigma for tilt in found])) < 1.2
+    assert judged(driven, found) < 1.2
 
 
 @pytest.mark.parametrize("rates_until", [100, 20])
