@@ -90,8 +90,7 @@ def integrate(samples: Sequence[InertialSample], begin: Knot, bias: Array, origi
     """The blocks of samples after `begin`, in the order of stamps, and the last knot; at least one has a rate.
 
     bias: (3,) rad/s of the gyroscope; origin: ns, the time at which a block begins. The rate of some sensors is a
-    sample, of others the mean since the sample before. So each counts for a quarter of an
-    interval before its stamp.
+    sample, of others the mean since the sample before. So each counts for a quarter of an interval before its stamp.
     """
     from scipy.spatial.transform import Rotation  # takes long to import
 

@@ -7,8 +7,8 @@ gyroscope and a of the accelerometer, in the sensor's frame. With C the rotation
 
 So the model is nearly linear and no heading is needed. The length of s is part of the state: gravity is measured.
 At rest the disturbance is small, so accelerations that turn show a rate across gravity. A steady turn about gravity
-looks like rest and a bias. So, unless it is slower than any rover turns, the state contains a rate t, whose sigma is
-the rate measured when the rest begins:
+looks like rest and a bias. A mean rate of `MIN_TURN` or more at rest may be such a turn. The state then contains its
+rate t, whose sigma is the mean rate when the rest begins:
 
     rate about gravity = b about gravity + t + noise        at rest
 
