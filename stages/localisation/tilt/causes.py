@@ -68,7 +68,6 @@ class Evidence:
     ups: Array  # (n, 3), in the inclinometer's frame
     mount: Array  # (3, 3), rotation from the inclinometer to the camera
     ground: Array  # (n, 3), upward normal of the ground in view, in the camera; NaN if unknown
-    sigma: float = float("nan")  # rad, of a tilt; NaN if unknown
     estimated: bool = False  # from accelerations and rates
 
 
@@ -83,6 +82,7 @@ class Cause:
     parameters: int = 0  # fitted numbers
     size: float = np.inf  # over the smallest that is a fault
     error: float = 0.0  # standard deviation of the size, for tilts with that variance
+    jumps: float = np.nan  # half of the squared differences of residuals between frames, over a tilt's variance
     undone: Array | None = None  # the corrected rotation from the inclinometer to the camera
 
     def score(self, variance: float) -> float:
@@ -109,6 +109,11 @@ class Fit:
     def misfit(self, ups: Array, cameras: Array | None = None) -> float:
         """Squared residuals of directions in the camera."""
         return float(np.sum(np.square(self.residuals(ups, cameras))))
+
+    def jumps(self, ups: Array) -> float:
+        """Half of the squared differences of residuals between frames; as large as the misfit if these are noise."""
+        within = self.evidence.segments[1:] == self.evidence.segments[:-1]
+        return float(np.sum(np.square(np.diff(self.residuals(ups), axis=0)[within]))) / 2
 
     def slope(self, ups: Array) -> float:
         """Squared mean slope of the ground in view, over its variance, by directions in the camera."""
@@ -247,7 +252,7 @@ def wrong_mount(fit: Fit) -> Cause:
         f"[{x:.4f}, {y:.4f}, {z:.4f}, {w:.4f}] instead."
     )
     size, error = angle / MIN_ANGLE, sigma / MIN_ANGLE
-    return fit.cause(fault, remedy, ups, 3, size=size, error=error, undone=turn @ mount)
+    return fit.cause(fault, remedy, ups, 3, size=size, error=error, jumps=fit.jumps(ups), undone=turn @ mount)
 
 
 def late_stamps(whole: Fit, sound: Cause, limit: float) -> Cause | None:

@@ -38,7 +38,6 @@ class _TiltSample:
     up: Array
     mount: Array
     ground: Array
-    sigma: float
     estimated: bool
 
 
@@ -56,7 +55,7 @@ class _Verdict:
         if not judged.fault:
             return replace(self, last=judged, clear=self.clear + judged.clear)
         vague = judged.fault == INCONSISTENT  # as when a fault begins or ends
-        reported = self.fault if vague and self.fault is not None else judged
+        reported = self.fault if vague and self.fault is not None and self.fault.firm else judged
         return _Verdict(judged, reported, self.faults + 1, self.clear + 1)
 
 
@@ -105,7 +104,7 @@ class CheckTilt(Stage):
             drift = max(float(np.trace(motion.covariance[3:, 3:])) / 3, 0.0)
             sample = _TiltSample(
                 motion.stamp, motion.segment, motion.camera, drift, tilt.up, mount.camera_from_inclinometer, ground,
-                np.nan if tilt.sigma is None else tilt.sigma, tilt.filtered,
+                tilt.filtered,
             )  # fmt: skip
             turn = _residual(sample, state.last)
             state.last = sample
@@ -161,8 +160,7 @@ def _diagnosis(state: TiltMemory) -> Diagnosis:
         np.array(column)
         for column in zip(*((s.stamp, s.segment, *_as_mounted(s, mount)) for s in state.kept), strict=True)
     )
-    sigma = float(np.median([sample.sigma for sample in state.kept]))
-    return diagnose(Evidence(stamps, segments, cameras, drift, ups, mount, ground, sigma, estimated))
+    return diagnose(Evidence(stamps, segments, cameras, drift, ups, mount, ground, estimated))
 
 
 def _as_mounted(sample: _TiltSample, mount: Array) -> tuple[Array, float, Array, Array]:

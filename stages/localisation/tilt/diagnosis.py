@@ -38,7 +38,7 @@ MAX_SOUND_NOISE = float(np.deg2rad(0.5))  # rad; beyond it large time offsets ar
 MAX_DELAY_NOISE = float(np.deg2rad(1.0))  # rad; a sound tilt of noise 0.6 degrees has less, and so has a late one
 MIN_DELAY_RATIO = 2.0  # of residuals without and with a large time offset; one of seconds fits any tilt a little
 MAX_SMALL_MOUNT = float(np.deg2rad(20))  # rad, of a mount error; a larger one explains a part of any fault, so it may
-MAX_MOUNT_SIGMAS, MAX_MOUNT_NOISE = 3.0, float(np.deg2rad(0.3))  # leave so many sigmas, or so much, rad
+MAX_MOUNT_JITTERS, MAX_MOUNT_NOISE = 1.3, float(np.deg2rad(0.15))  # leave so many times the jitter, or so much, rad
 MAX_SLOPE = float(np.deg2rad(20))  # rad; ground that is steeper in every frame means a wrong tilt
 MIN_GAIN = 25.0  # of a fault's score over that of no fault: five sigma
 MIN_RIVAL_GAIN = 10.0  # over the scores of other faults; those within it are named too
@@ -60,6 +60,7 @@ class Diagnosis:
     fault: str  # short name, empty if none is found
     sentence: str
     clear: bool  # whether the motion was sufficient to see every fault
+    firm: bool = True  # false of a large mount error, which more frames may contradict
 
 
 class _Hypotheses(NamedTuple):
@@ -94,12 +95,20 @@ class _Hypotheses(NamedTuple):
         """RMS angle, rad, between tilt and camera under a cause."""
         return float(self.noise * np.sqrt(cause.misfit / self.degrees_of_freedom))
 
+    def jitter(self, cause: Cause) -> float:
+        """The same by the jumps between frames; both are alike if the cause leaves only noise."""
+        return float(self.noise * np.sqrt(cause.jumps / self.degrees_of_freedom))
+
+    def is_large_mount(self, cause: Cause) -> bool:
+        """Whether the cause is an error of the mount that explains a part of any fault."""
+        return cause is self.mount and cause.size * MIN_ANGLE > MAX_SMALL_MOUNT
+
     def explains(self, cause: Cause) -> bool:
         """Whether tilt and camera agree well enough under a time offset or a large error of the mount to name it; true
         of other causes."""
         left = self.residual(cause)
-        if cause is self.mount and cause.size * MIN_ANGLE > MAX_SMALL_MOUNT:
-            return left <= max(MAX_MOUNT_NOISE, MAX_MOUNT_SIGMAS * self.evidence.sigma)  # which may be NaN
+        if self.is_large_mount(cause):
+            return left <= max(MAX_MOUNT_NOISE, MAX_MOUNT_JITTERS * self.jitter(cause))
         if cause is not self.offset:
             return True
         large = cause.size * MIN_OFFSET > MAX_OFFSET
@@ -179,7 +188,7 @@ def _faulty(tried: _Hypotheses, best: Cause) -> Diagnosis:
     sentence = (
         f"{fault[0].upper()}{fault[1:]}. Without this fault {_agreement(tried, best)} ({tried.frames} frames). {remedy}"
     )
-    return Diagnosis(fault, sentence, True)
+    return Diagnosis(fault, sentence, True, not tried.is_large_mount(best))
 
 
 def _agreement(tried: _Hypotheses, best: Cause) -> str:

@@ -1,7 +1,7 @@
 """A simulated drive without images: the motion of its camera and the readings of its inclinometer."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -86,6 +86,12 @@ class Drive:
         drift = np.arange(frames) * np.radians(self.odometry) ** 2
         stamps = np.array(self.stamps(frames))
         return Evidence(stamps, np.ones(frames, int), self.turns(frames), drift, ups, mount, self.ground(frames))
+
+
+def misread(drive: Drive, order: list[int], signs: list[int], heading: float) -> Evidence:
+    """Evidence of orientations whose quaternion's numbers have another order and other signs."""
+    true = Rotation.from_euler("z", heading) * Rotation.from_matrix(drive.orientations())
+    return replace(drive.evidence(), ups=Rotation.from_quat(true.as_quat()[:, order] * signs).as_matrix()[:, 2])
 
 
 def readings(drive: Drive, ups: Array | None = None, frames: int = FRAMES) -> list[tuple[CameraMotion, Tilt]]:

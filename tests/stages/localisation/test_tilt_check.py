@@ -11,7 +11,7 @@ from flow.contracts import Severity
 from stages import CheckTilt, Mount, PointCloud, Tilt, TiltHealth, Transform
 from stages.data import Array
 from tests.stages.builders import cloud_of
-from tests.stages.localisation.drive import FRAMES, Drive, motions, readings
+from tests.stages.localisation.drive import FRAMES, Drive, misread, motions, readings
 from tests.stages.running import Running
 from tests.tilt_faults import flipped
 
@@ -63,6 +63,25 @@ def test_an_estimated_tilt_has_a_remedy_of_its_own(filtered, remedy):
     for motion, tilt in readings(DRIVE):
         stage(motion, Tilt(motion.stamp, flip(tilt.up), sigma=0.003, filtered=filtered), MOUNT)
     assert remedy in stage.finding().sentence
+
+
+@pytest.mark.parametrize("sigma", [None, 0.003, 0.01, np.pi / 2])
+@pytest.mark.parametrize("order", [[0, 2, 1, 3], [1, 0, 2, 3], [0, 3, 2, 1]])
+def test_a_large_mount_error_that_few_frames_show_and_more_contradict_is_not_reported(order, sigma):
+    drive, stage, named = Drive(1, 4.0), Running(CheckTilt()), []
+    for motion, tilt in readings(drive, misread(drive, order, [1, 1, 1, 1], 0.7).ups):
+        named.append(stage(motion, replace(tilt, sigma=sigma), Mount(0, drive.mount)).fault)
+    assert named[-1] == "inconsistent"
+    assert "no remedy is known" in stage.finding().sentence
+
+
+@pytest.mark.parametrize("sigma", [None, 0.003, np.pi / 2])
+def test_a_large_mount_error_is_reported_at_any_stated_sigma(sigma):
+    turned, stage = Rotation.from_euler("z", 40, degrees=True).as_matrix(), Running(CheckTilt())
+    noisy = Drive(2, 8.0, noise=1.2)
+    for motion, tilt in readings(noisy):
+        stage(motion, replace(tilt, sigma=sigma), Mount(0, noisy.mount @ turned))
+    assert re.match(r"The mount of the inclinometer is wrong by (39|40)\.", stage.finding().sentence)
 
 
 @pytest.mark.parametrize(("late", "fault"), [(0, ""), (5, "the mount of the inclinometer is wrong")])

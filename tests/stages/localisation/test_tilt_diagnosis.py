@@ -13,7 +13,7 @@ from stages.data import Array
 from stages.localisation.tilt.causes import Cause, Evidence
 from stages.localisation.tilt.diagnosis import _same, diagnose
 from tests.conftest import slow
-from tests.stages.localisation.drive import Drive
+from tests.stages.localisation.drive import Drive, misread
 from tests.tilt_faults import degrees_as_radians, exchanged, flipped, radians_as_degrees
 
 DRIVES = [
@@ -79,12 +79,6 @@ def test_a_tilt_that_is_upside_down_is_named_with_the_frame_to_correct(signs, fa
     assert found.fault == f"{fault}: by the tilt the rover is upside down", found.sentence
     assert remedy in found.sentence
     assert "source." not in found.sentence
-
-
-def misread(drive: Drive, order: list[int], signs: list[int], heading: float) -> Evidence:
-    """Evidence of orientations whose quaternion's numbers have another order and other signs."""
-    true = Rotation.from_euler("z", heading) * Rotation.from_matrix(drive.orientations())
-    return replace(drive.evidence(), ups=Rotation.from_quat(true.as_quat()[:, order] * signs).as_matrix()[:, 2])
 
 
 INVERSE, W_FIRST = ([0, 1, 2, 3], [-1, -1, -1, 1]), ([3, 0, 1, 2], [1, 1, 1, 1])
