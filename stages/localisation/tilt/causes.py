@@ -36,7 +36,7 @@ _TURN = (
 _REVERSED = (
     "If the log has orientations, z of their world points down, as in NED; convert them to a world with z up (ENU). If "
     "it has accelerations, their sign is opposite: at rest an accelerometer reads +9.8 m/s2 along the axis that points "
-    "up."
+    "up. 'accelerations' of the source, with their field and sign -1, negates them."
 )
 _UPSIDE_DOWN = {  # exchanged, signs of pitch and roll -> fault and remedy, where the sign of up is flipped too
     (False, -1, -1): ("up and down are exchanged", _REVERSED),

@@ -103,6 +103,10 @@ class _Hypotheses(NamedTuple):
         """Whether the cause is an error of the mount that explains a part of any fault."""
         return cause is self.mount and cause.size * MIN_ANGLE > MAX_SMALL_MOUNT
 
+    def is_upside_down(self, cause: Cause) -> bool:
+        """Whether the cause inverts up in the inclinometer's frame, as no gyroscope does."""
+        return cause.undone is not None and (self.evidence.mount.T @ cause.undone)[2, 2] < 0
+
     def explains(self, cause: Cause) -> bool:
         """Whether tilt and camera agree well enough under a time offset or a large error of the mount to name it; true
         of other causes."""
@@ -177,7 +181,7 @@ def _faulty(tried: _Hypotheses, best: Cause) -> Diagnosis:
     rivals = [rival for rival in rivals if tried.explains(rival)]
     faults = [best.fault, *(rival.fault for rival in rivals if not _same(best, rival))]
     remedy = best.remedy
-    if tried.evidence.estimated and best in (*tried.axes, tried.units):
+    if tried.evidence.estimated and best in (*tried.axes, tried.units) and not tried.is_upside_down(best):
         remedy = ESTIMATED
     if best is tried.mount and tried.offset is None:
         faults.insert(1, "its stamps are late or early")
@@ -203,9 +207,9 @@ def _agreement(tried: _Hypotheses, best: Cause) -> str:
 
 def _inconsistent(tried: _Hypotheses) -> Diagnosis:
     likely = (
-        "the axes, signs and units of gyroscope and accelerometer, their clock"
+        "the axes, signs and units of gyroscope and accelerometer, their mount and clock"
         if tried.evidence.estimated
-        else "its axes, unit, mount and clock, the convention of its quaternions"
+        else "its axes, unit, mount and clock, the convention of its quaternions, if it has any"
     )
     sentence = (
         f"Tilt and camera disagree by {degrees(tried.residual(tried.sound))} ({tried.frames} frames), and no single "

@@ -111,6 +111,18 @@ def test_the_remedy_of_an_estimated_tilt_is_its_gyroscope(change):
     assert "source." not in found.sentence
 
 
+@pytest.mark.parametrize(("signs", "remedy"), [
+    ([-1, -1, -1], "'accelerations' of the source, with their field and sign -1, negates them"),
+    ([1, -1, -1], "Rotate the inclinometer's frame by 180 degrees about x"),
+    ([1, 1, -1], "z of its frame must point up"),
+])  # fmt: skip
+def test_the_remedy_of_an_estimated_tilt_that_is_upside_down_is_not_its_gyroscope(signs, remedy):
+    found = diagnose(replace(DRIVES[0].evidence(change=lambda up: up * signs), estimated=True))
+    assert "by the tilt the rover is upside down" in found.fault
+    assert remedy in found.sentence
+    assert "gyroscope" not in found.sentence
+
+
 def test_the_ground_separates_up_from_down_and_the_sentence_names_it():
     found = diagnose(DRIVES[0].evidence(change=lambda up: -up))
     ground = r"Without this fault the ground in view is \d\.\d+ degrees off level on average, with it overhead \("
@@ -237,3 +249,4 @@ def test_a_random_walk_of_the_tilt_is_inconsistent():
     found = diagnose(replace(drive.evidence(), ups=ups / np.linalg.norm(ups, axis=1)[:, None]))
     assert found.fault == "inconsistent"
     assert "no single fault of the inclinometer explains it" in found.sentence
+    assert "the convention of its quaternions, if it has any" in found.sentence
