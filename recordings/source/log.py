@@ -31,7 +31,7 @@ from recordings.source.moving_mount import MAX_GAP_NS, MovingMount
 from recordings.source.resolution import SourceResolution
 from recordings.source.settings import LogSettings
 from recordings.source.stream_readers import StreamReaders, by_channel
-from recordings.source.tilt_reading import Sampled, TiltReading, by_stamp, estimated_tilts
+from recordings.source.tilt_reading import Sampled, TiltReading, estimated_tilts, in_order_of_stamps
 from recordings.source.topics import TopicReader, attempt, with_lookahead
 from recordings.video.formats import VIDEO, VIDEO_NOTE
 from stages.data import CameraImage, Mount, Tilt
@@ -141,7 +141,7 @@ class McapLog(AbstractContextManager["McapLog"]):
 
     def _rated(self, tilt: TiltReading, part: TimeRange) -> Iterator[tuple[int, str, Any]]:
         """The samples with a rate, to whose stamps tilts are estimated."""
-        for log_time, item in by_stamp(tilt, self._samples(by_channel(self._readers.of_samples()), part)):
+        for log_time, item in in_order_of_stamps(tilt, self._samples(by_channel(self._readers.of_samples()), part)):
             if isinstance(item, LogError) or item.rate is not None:
                 yield log_time, "inclinometer", item
 

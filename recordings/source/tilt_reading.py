@@ -127,7 +127,12 @@ class TiltReading:
 
     def fault(self, estimator: UpEstimator) -> Finding | None:
         """A fault of the sensors that the samples show, after a run."""
-        if estimator.contradicts_gravity:
+        if estimator.contradicts_gravity and abs(estimator.measured_gravity - 1) < GRAVITY_RTOL:
+            sentence = (
+                f"Gravity is {estimator.measured_gravity:.2f} by the accelerations on {self.topic}: they are in g, so "
+                "the estimated tilt is wrong. Convert them to m/s2 in the driver or the log."
+            )
+        elif estimator.contradicts_gravity:
             unit = ", and its unit is m/s2, not g" if estimator.gravity == 1 else ""
             sentence = (
                 f"Gravity is {estimator.measured_gravity:.2f} m/s2 by the accelerations on {self.topic}, so the "
@@ -155,8 +160,7 @@ def _gravity(estimator: UpEstimator) -> str:
     measured, given = estimator.measured_gravity, estimator.gravity
     found = f"gravity is {measured:.2f} m/s2"
     if given is not None:
-        differs = abs(measured / given - 1) > GRAVITY_RTOL
-        return f"{found}, but 'gravity' of the source is {given:g}; correct it" if differs else found
+        return f"{found}, but 'gravity' of the source is {given:g}" if estimator.contradicts_gravity else found
     near = [name for name, value in GRAVITIES.items() if abs(measured / value - 1) < GRAVITY_RTOL]
     return f"{found}, as on {near[0]}" if near else f"{found}, unlike on {', '.join(GRAVITIES)}; check the unit"
 
@@ -166,7 +170,7 @@ def estimated_tilts(
 ) -> Iterator[tuple[int, Tilt | LogError]]:
     """The tilts of samples in the order of log time, with the log times of their samples; errors stay in place."""
     latest = 0
-    for log_time, item in _answers(by_stamp(reading, samples), estimator):
+    for log_time, item in _answers(in_order_of_stamps(reading, samples), estimator):
         latest = max(latest, log_time)
         yield latest, item
 
@@ -197,7 +201,7 @@ def _answered(waiting: deque[Sampled], tilts: list[Tilt]) -> Iterator[tuple[int,
                 break
 
 
-def by_stamp(reading: TiltReading, samples: Iterable[Sampled]) -> Iterator[Sampled]:
+def in_order_of_stamps(reading: TiltReading, samples: Iterable[Sampled]) -> Iterator[Sampled]:
     """The samples in the order of stamps; a LogError in place of one whose stamp does not follow the one before.
 
     Those of two topics may be logged out of order, up to 3 s apart.
@@ -223,6 +227,8 @@ def by_stamp(reading: TiltReading, samples: Iterable[Sampled]) -> Iterator[Sampl
         if sample.stamp <= stamp or sample.stamp < given or (ahead and not believed):
             doubted[topic] = sample.stamp
             why = f"does not follow {stamp} ns"
+            if ahead:
+                why = f"is {(sample.stamp - stamp) / 1e9:.1f} s ahead of the one before"
             if stamp < sample.stamp < given:
                 why = f"is {(reached - sample.stamp) / 1e9:.1f} s behind the other topic's; log both within 3 s"
             names = reading.gyroscope, reading.topic

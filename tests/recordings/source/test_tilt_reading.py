@@ -20,7 +20,7 @@ from recordings.inventory.text import format_description
 from recordings.ros2.cdr import make
 from recordings.ros2.tilt_from_msg import AccelerationField, acceleration_of
 from recordings.ros2.to_msg import header, imu, odometry, quaternion, raw_imu, transform_message
-from recordings.source.settings import TimeOffsets
+from recordings.source.settings import LogSettings, TimeOffsets
 from recordings.source.tilt_reading import TiltReading, estimated_tilts
 from stages.data import Pose, Tilt, Transform
 from tests.conftest import rewrite, slow, write_messages
@@ -142,7 +142,8 @@ def test_a_broken_sample_is_lost_alone_and_so_is_a_wrong_stamp(tmp_path):
     tilts, lost, _ = read(written(tmp_path / "log.mcap", driven, broken))
     assert len(tilts) == len(driven.stamps) - 3
     assert ["'linear_acceleration' contains" in sentence for sentence in lost] == [False, False, True]
-    assert all("does not follow" in sentence for sentence in lost[:2])
+    assert "is 3600.0 s ahead of the one before" in lost[0]
+    assert "does not follow" in lost[1]
     assert driven.errors(tilts).max() < 0.6
 
 
@@ -195,6 +196,24 @@ def test_a_gravity_that_the_accelerations_contradict_is_a_fault(tmp_path, gravit
     assert (found.severity, found.about) == (Severity.FAULT, "tilt")
     assert found.sentence.startswith(f"Gravity is 9.79 m/s2 by the accelerations on {IMU}, ")
     assert f"'gravity' of the source is {gravity:g}{unit}. Correct it, or leave it out." in found.sentence
+
+
+def test_accelerations_in_g_are_a_fault_beside_a_right_gravity(tmp_path):
+    path = written(tmp_path / "log.mcap", drive(seconds=12), lambda n, t, rate, force: kalibr(n, t, rate, force / 9.81))
+    with McapSource(gravity=9.81).open(path) as log:
+        assert len(list(log.events())) > 1000
+        found = log.faults()["inclinometer"]
+    assert found.sentence.startswith(f"Gravity is 1.00 by the accelerations on {IMU}: they are in g, so ")
+    assert "Convert them to m/s2" in found.sentence
+    assert "'gravity'" not in found.sentence
+
+
+def test_a_bias_of_the_accelerometer_contradicts_gravity_in_the_note_and_the_fault_or_in_neither():
+    reading = TiltReading(TiltKind.ESTIMATE, IMU, IMU)
+    for measured, contradicts in ((1.70, False), (1.90, True)):
+        made = UpEstimator("imu_link", 0.05, gravity=1.62, seconds=10.0, measured_gravity=measured)
+        assert ("but 'gravity' of the source is 1.62" in reading.note(made, LogSettings())) == contradicts
+        assert (reading.fault(made) is not None) == contradicts
 
 
 def split(number, stamp, rate, force):
