@@ -23,6 +23,7 @@ from stages.data import StereoCamera, Tilt
 
 MAX_VERIFIED_BYTES = 300_000_000  # of a log whose messages are all read; it takes a second
 LAST_CALIBRATIONS = 20  # of a large log, that are read
+MIN_STEP = 0.45  # s, between the delays of two readings, for the second to begin a stretch
 Stamps = NDArray[np.int64]
 
 
@@ -98,7 +99,7 @@ def describe(
             "tilt_gap_s": None if max_gap is None else max_gap / 1e9,
             "delay_s": [float(np.quantile(delays, part)) / 1e9 for part in (0, 0.5, 1)] if delays else None,
             "tilt_delay_s": float(np.median(of_tilts)) / 1e9 if of_tilts else None,
-            "tilt_delay_spread_s": float(np.ptp(np.quantile(of_tilts, (0.1, 0.9)))) / 1e9 if of_tilts else None,
+            "tilt_delay_step_s": _step(np.asarray(of_tilts) / 1e9),
             "tilt_offset_s": log.time_offset("inclinometer") / 1e9,
         },
         "poses": poses,
@@ -181,6 +182,21 @@ def _tilts(log: McapLog, damage: Damage, delays: array[int]) -> Stamps:
         elif stream == "inclinometer":
             damage.add(str(item))
     return np.asarray(stamps, np.int64)
+
+
+def _step(delays: NDArray[np.float64]) -> float:
+    """The largest change, s, from one stretch of delays to the next where a clock was set; 0 if there is none.
+
+    Single delays do not count, nor do changes between stretches whose ranges meet: readings that are logged in batches.
+    """
+    if not delays.size:
+        return 0.0
+    starts = np.append(0, np.flatnonzero(np.abs(np.diff(delays)) > MIN_STEP) + 1)
+    lengths = np.diff(starts, append=delays.size)
+    last = lengths > 1
+    low, high, total = (of.reduceat(delays, starts)[last] for of in (np.minimum, np.maximum, np.add))
+    apart = np.maximum(low[1:] - high[:-1], low[:-1] - high[1:]) > MIN_STEP
+    return float(np.abs(np.diff(total / lengths[last]))[apart].max(initial=0.0))
 
 
 def _is_verified(log: McapLog) -> bool:

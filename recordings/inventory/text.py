@@ -65,12 +65,12 @@ def _stamp_doubts(frames: dict[str, Any]) -> Iterator[str]:
         yield f"the stamps of left and right images differ by up to {offset * 1e3:.3g} ms; {remedy}"
     late = (frames["tilt_delay_s"] or 0) - (frames["delay_s"] or [0, 0])[1]
     corrected = f"--set source.time_offset.inclinometer={frames['tilt_offset_s'] + late:.3f}s corrects the tilts"
+    if (step := frames["tilt_delay_step_s"]) >= MAX_TILT_DELAY:
+        remedy = "if a clock was set, cut the log there and run each part; info then names its source.time_offset"
+        yield f"the stamps of tilts jump by {step:.1f} s against their log times; {remedy}"
     if abs(late) > MAX_LATENESS_NS / 1e9 and frames["with_tilt"] == 0:
         differ = f"the stamps of tilts and images are of clocks that differ by {abs(late):.1f} s"
         yield f"{differ}; record both with one; {corrected}, if both are logged equally soon"
-    elif (spread := frames["tilt_delay_spread_s"] or 0) > MAX_TILT_DELAY:
-        remedy = "if a clock was set, cut the log there and run each part; info then names its source.time_offset"
-        yield f"the stamps of tilts are up to {spread:.1f} s further from their log times than others; {remedy}"
     elif late > MAX_TILT_DELAY:
         remedy = (
             f"if no clock is wrong, --set tilt.patience={late + 2:.0f}s makes a run wait for them; else {corrected}"

@@ -15,7 +15,7 @@ from recordings import McapSource
 from recordings.containers.container import HEAD_BYTES
 from recordings.containers.header import peek_stamp
 from recordings.containers.opening import open_recording
-from recordings.inventory.description import Damage, describe
+from recordings.inventory.description import Damage, _step, describe
 from recordings.inventory.text import format_description
 from recordings.mcap.file import McapFile
 from stages.data import Transform
@@ -183,10 +183,34 @@ def test_tilts_that_are_logged_too_late_for_a_run_are_doubted(tmp_path):
 
 
 def test_stamps_of_tilts_that_are_set_back_within_the_log_are_doubted(tmp_path):
-    doubt = "doubtful: the stamps of tilts are up to 3.0 s further from their log times than others; if a clock was set"
+    doubt = "doubtful: the stamps of tilts jump by 3.0 s against their log times; if a clock was set"
     back = changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 3}, range(3, FRAMES))
     assert doubt in text_of(tmp_path, back)
-    assert "further from" not in text_of(tmp_path, changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 3}))
+    assert "jump by" not in text_of(tmp_path, changed(TILT, {"header.stamp.sec": lambda seconds: seconds - 3}))
+
+
+BATCHES = np.tile(np.linspace(2.5, 0, 250), 8)[100:-100]  # s, from stamps to log times
+
+
+@pytest.mark.parametrize(("delays", "step"), [
+    (BATCHES, 0), (BATCHES + 3600 * (np.arange(1800) >= 1640), 3600), (np.repeat([0, -3600, 0], 40), 3600),
+    (np.repeat([0.1, 1.0], [99, 2]) + np.tile([0, 0.05], 51)[:101], 0.9), (np.repeat([0, 3600, 0], [50, 1, 50]), 0),
+    (np.array([]), 0),
+])  # fmt: skip
+def test_a_clock_that_was_set_is_a_lasting_step_of_the_delays(delays, step):
+    assert _step(delays) == pytest.approx(step, rel=0.01)
+
+
+def test_tilts_that_are_logged_in_batches_need_patience_and_no_cut(tmp_path):
+    text = text_of(tmp_path)
+    described = inventory_of(tmp_path / "log.mcap")
+    described["frames"] |= {"tilt_delay_s": 1.25, "tilt_delay_step_s": _step(BATCHES)}
+    assert "--set tilt.patience=3s" in format_description(described)
+    assert "jump by" not in format_description(described)
+    described["frames"] |= {"tilt_delay_step_s": 3600.0}
+    assert "--set tilt.patience=3s" in format_description(described)
+    assert "jump by 3600.0 s" in format_description(described)
+    assert "patience" not in text
 
 
 WIDER = "differ by up to 8 ms; if they are taken at one time, --set stereo.slop=8ms pairs most of them"
