@@ -133,7 +133,7 @@ def test_a_part_is_estimated_from_the_beginning_whatever_the_clock_of_the_rates(
     log = rewrite(path, tmp_path / "log.mcap", time=lambda topic, time: time + 3_000_000 * ("accel" in topic))
     source = McapSource(time_offset=TimeOffsets(gyroscope=behind))
     whole = {tilt.stamp: tilt for tilt in read(log, source)[0]}
-    for start in np.arange(24, 24.014, 0.002):
+    for start in (24.008, 24.01, 24.012):
         with source.open(log) as opened:
             opened.narrow(start, start + 0.1)
             part = [item for _, stream, item in opened.events() if stream == "inclinometer"]
